@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rosafe.component import generate
-from tests import harness
+from tests import fork_server, harness
 from tests.bass.pulseaudio import PulseServer
 from tests.dsp.implementations import NUMPY, Choice, levels
 
@@ -67,6 +67,13 @@ generate.ensure_messages()  # test modules import rosAFE.msg and bass.msg at the
 def _default_signals() -> None:
     """Run in every process that runs tests, before it starts other processes; not in the coordinator of xdist."""
     harness.let_children_have_default_signals()
+
+
+@pytest.fixture(autouse=True)
+def _import_variables() -> Iterator[None]:
+    """Restore the variables that decide whether a program can be a fork; commands in this process change them."""
+    yield
+    fork_server.restore_environment()
 
 
 @pytest.fixture(scope="session")

@@ -74,6 +74,15 @@ def can_fork(command: Sequence[str], env: Mapping[str, str], messages: str) -> b
     )
 
 
+def restore_environment() -> None:
+    """Give the variables of this process that affect imports their first values."""
+    first, now = _affecting_imports(_ENV), _affecting_imports(os.environ)
+    if first != now:
+        for name in now.keys() - first.keys():
+            del os.environ[name]
+        os.environ.update(first)
+
+
 class ForkedProcess:
     """A program started by the server, with the methods of `subprocess.Popen` that the tests use."""
 

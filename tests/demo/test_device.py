@@ -9,7 +9,7 @@ import soundfile
 
 from rosafe.localization import model_cache
 from tests.bass.pulseaudio import PulseServer
-from tests.demo.running import DEMO_SECONDS, PORTS, demo, path, table
+from tests.demo.running import DEMO_SECONDS, PORTS, Demo, path, table
 
 
 def environment(pulse: PulseServer) -> dict[str, str]:
@@ -24,7 +24,7 @@ def test_device(pulse: PulseServer, tmp_path: Path) -> None:
     soundfile.write(tmp_path / "left.wav", np.stack((noise, delayed), axis=1), 44100, subtype="PCM_16")
     with (
         pulse.play(tmp_path / "left.wav"),
-        demo("pulse", "--seconds", "3", "--out", tmp_path / "out", **environment(pulse)) as running,
+        Demo("pulse", "--seconds", "3", "--out", tmp_path / "out", env=environment(pulse)) as running,
     ):
         assert running.wait(DEMO_SECONDS) == 0, running
         running.assert_gone()
@@ -39,7 +39,7 @@ def test_device(pulse: PulseServer, tmp_path: Path) -> None:
 
 def test_unplugged(pulse: PulseServer, tmp_path: Path) -> None:
     """If the device is unplugged during the recording, one line reports it, and no figure is saved."""
-    with demo("pulse", "--seconds", "60", "--out", tmp_path / "out", **environment(pulse)) as running:
+    with Demo("pulse", "--seconds", "60", "--out", tmp_path / "out", env=environment(pulse)) as running:
         running.wait_for_output("recording")
         pulse.kill()
         assert running.wait(DEMO_SECONDS) == 1

@@ -151,11 +151,13 @@ def test_doctor_finds_the_prebuilt_parts(root: Path, tmp_path: Path) -> None:
 def test_nodes_run_from_the_packages(root: Path, private_graph: tuple[Graph, MasterProcess], tmp_path: Path) -> None:
     """They write nothing into their packages or into the home folder."""
     graph, _ = private_graph
+    home = tmp_path / "home"  # not the folder of the test's master
+    home.mkdir()
     ros = {
         "ROS_MASTER_URI": graph.uri,
         "ROS_IP": "127.0.0.1",
-        "HOME": str(tmp_path),
-        "ROS_LOG_DIR": str(tmp_path / "log"),
+        "HOME": str(home),
+        "ROS_LOG_DIR": str(home / "log"),
     }
     plain = ["env", "-i", *(f"{name}={value}" for name, value in {**environment(), **ros}.items())]
     before = content(root)
@@ -175,7 +177,7 @@ def test_nodes_run_from_the_packages(root: Path, private_graph: tuple[Graph, Mas
         assert "genom_success: True" in done.stdout and "float64[] data" in done.stdout
         assert bass.stop() == 0 and rosafe.stop() == 0
     assert content(root) == before
-    assert {path.name for path in tmp_path.iterdir()} <= {"log"}
+    assert {path.name for path in home.iterdir()} <= {"log"}
 
 
 @pytest.mark.exploration
