@@ -22,23 +22,27 @@ from report import Report, arguments
 SECONDS = 60.0  # of a measurement
 SETTLE_SECONDS = 10.0
 ONSETS = tuple(range(4, 60, 8))  # s in the scene
+TALK_SECONDS = 4  # from each onset
 PRESENT = 0.5
 START_SECONDS = 120.0  # including the model
 
 
 def write_scene(folder: Path) -> Path:
-    """Write a scene: a talker all the time, and another one every 8 s for 4 s, from another direction each time."""
+    """Write a scene: a talker all the time, and another one every 8 s for 4 s, from another direction each time.
+
+    Each has a sound of its own: equal sounds from two directions are heard from a direction between them.
+    """
     random = np.random.default_rng(1)
-    count = 10 * graph.RATE
-    levels = np.repeat(10 ** (random.uniform(-20, 0, 101) / 20), graph.RATE // 10)[:count]
-    soundfile.write(folder / "talker.wav", 0.1 * levels * random.standard_normal(count), graph.RATE)
-    sources = ["{name: constant, file: talker.wav, loop: true, level_db: -30, azimuth: -60}"]
+    sources = ["{name: constant, file: constant.wav, loop: true, level_db: -30, azimuth: -60}"]
     for number, onset in enumerate(ONSETS):
         azimuth = -20 + 80 * number / (len(ONSETS) - 1)
         sources.append(
-            f"{{name: s{number}, file: talker.wav, loop: true, level_db: -25, azimuth: {azimuth:.0f}, start: {onset}, "
-            f"end: {onset + 4}}}"
+            f"{{name: s{number}, file: s{number}.wav, level_db: -25, azimuth: {azimuth:.0f}, start: {onset}, "
+            f"end: {onset + TALK_SECONDS}}}"
         )
+    for name, seconds in (("constant", 10), *((f"s{number}", TALK_SECONDS) for number in range(len(ONSETS)))):
+        levels = np.repeat(10 ** (random.uniform(-20, 0, 10 * seconds) / 20), graph.RATE // 10)
+        soundfile.write(folder / f"{name}.wav", 0.1 * levels * random.standard_normal(len(levels)), graph.RATE)
     path = folder / "scene.yaml"
     path.write_text("seed: 1\nnoise: {snr_db: 30}\nsources:\n" + "".join(f"  - {source}\n" for source in sources))
     return path
@@ -62,7 +66,7 @@ def onset_delays(truths: list, sources: list) -> list[float]:
             delays += [
                 message.header.stamp.to_sec() - begin
                 for message in sources
-                if begin < message.header.stamp.to_sec() < begin + 4
+                if begin < message.header.stamp.to_sec() < begin + TALK_SECONDS
                 and any(
                     s.probability > PRESENT and abs(s.azimuth - azimuth) < math.radians(12) for s in message.sources
                 )
