@@ -102,7 +102,8 @@ class Comparison:
     measure : callable
         Computes the deviation with a function like `process`.
     requires : str
-        A module, or a path, without which the comparison is skipped.
+        A module, or a path, without which the comparison is skipped. A package that imports its parts at their first
+        use (librosa) is named with the part.
     short : bool
         Whether it is part of the short form, which needs no other toolbox.
     """
@@ -133,8 +134,9 @@ class Comparison:
 @lru_cache
 def _import_problem(module: str) -> str:
     """Return the reason for which a module cannot be imported; empty if it can."""
-    if not importlib.util.find_spec(module):
-        return f"{module} is not installed"
+    package = module.partition(".")[0]
+    if not importlib.util.find_spec(package):
+        return f"{package} is not installed"
     try:
         importlib.import_module(module)
     except Exception as problem:  # any failure of another toolbox, which must not end the validation

@@ -67,7 +67,7 @@ def hohmann_filters(process: Process) -> float:
     "of the frames",
     0.1,
     scaled("pitch", 1.03),
-    requires="librosa",
+    requires="librosa.core.pitch",
     short=False,
 )
 def pyin(process: Process) -> Measured:
@@ -91,7 +91,7 @@ def pyin(process: Process) -> Measured:
     "(relative)",
     1e-6,
     scaled("spectralFeatures", 1.00001),
-    requires="librosa",
+    requires="librosa.feature.spectral",
     short=False,
 )
 def librosa_features(process: Process) -> float:
