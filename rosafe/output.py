@@ -11,7 +11,7 @@ import os
 import shlex
 import shutil
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -262,6 +262,30 @@ def _remove(path: Path) -> None:
         path.unlink()
 
 
+def check_target(target: str | Path, replace: bool) -> None:
+    """Raise OutputError if `new_file` would refuse an output: to be called before a long computation."""
+    AtomicOutput(target, replace).close()
+
+
+def write_files(contents: Mapping[Path, bytes], replace: bool) -> None:
+    """Write several files, of which none appears before all have been written. Raises OutputError."""
+    with contextlib.ExitStack() as closing:
+        parts = []
+        for target, data in contents.items():
+            part = AtomicOutput(target, replace)
+            closing.callback(part.close)
+            parts.append(part)
+            try:
+                _write(part.begin(), data)
+            except OSError as problem:
+                raise part.error(problem) from problem
+        for part in parts:
+            try:
+                part.complete()
+            except OSError as problem:
+                raise part.error(problem) from problem
+
+
 def write_whole(target: str | Path, data: bytes, mode: int | None = None) -> None:
     """Write `data` to the file `target`, which keeps its old contents on failure, also after a power cut.
 
@@ -270,9 +294,13 @@ def write_whole(target: str | Path, data: bytes, mode: int | None = None) -> Non
     with new_file(target, True, 0o666 if mode is None else mode) as descriptor:
         if mode is not None:
             os.fchmod(descriptor, mode)  # also of a part that was left
-        rest = memoryview(data)
-        while rest:
-            rest = rest[os.write(descriptor, rest) :]
+        _write(descriptor, data)
+
+
+def _write(descriptor: int, data: bytes) -> None:
+    rest = memoryview(data)
+    while rest:
+        rest = rest[os.write(descriptor, rest) :]
 
 
 def _checked_target(target: Path, replace: bool) -> Path:

@@ -29,11 +29,11 @@ def run(options: argparse.Namespace) -> int:
     """Print the paragraph, or the BibTeX entries."""
     results = [*options.results, *options.more_inputs]
     if len(results) > 1:
-        options.usage_error(f"expected at most one result, got {len(results)}")
+        options.usage_error(f"RESULT: expected at most one result, got {len(results)}")
     if results and (options.outputs or options.settings):
-        options.usage_error("--outputs, --set: a result already has its representations and parameters")
+        options.usage_error("--outputs, --set: expected no result, got one: a result already has its representations")
     if options.settings and not options.outputs:
-        options.usage_error("--set: expected --outputs as well")
+        options.usage_error("--set: expected --outputs as well, got none")
     from rosafe.interface import KINDS, citing
     from rosafe.offline.chain import needed
 

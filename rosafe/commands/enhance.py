@@ -7,14 +7,14 @@ length and sample rate."""
 from __future__ import annotations
 
 import argparse
-import contextlib
 import io
 from pathlib import Path
 from typing import Any
 
+from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._parameters import add_settings, ear_channels, parameters_of
-from rosafe.output import new_file
+from rosafe.output import check_target, write_files
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "                      [--set NAME=VALUE ...] [--force]"
     )
     parser.add_argument("inputs", nargs="*", metavar="SOUND", help="sound file or rosbag with two ears")
-    parser.add_argument("--azimuth", type=float, required=True, metavar="DEG", help="direction of the wanted sound")
+    parser.add_argument(
+        "--azimuth",
+        type=option_types.number(-360.0, 360.0, "a number of degrees"),
+        required=True,
+        metavar="DEG",
+        help="direction of the wanted sound",
+    )
     parser.add_argument(
         "--head",
         metavar="FILE",
@@ -52,27 +58,22 @@ def run(options: argparse.Namespace) -> int:
     """Enhance and write the sound."""
     inputs = [*options.inputs, *options.more_inputs]
     if len(inputs) != 1:
-        options.usage_error(f"expected one sound file, got {len(inputs)}")
+        options.usage_error(f"SOUND: expected one file, got {len(inputs)}")
     target = Path(options.to)
     if target.suffix.lower() != ".wav":
-        options.usage_error(f"-o {target}: expected a name that ends in .wav")
+        options.usage_error(f"-o: expected a name that ends in .wav, got {target}")
+    check_target(target, options.force)
     from rosafe.localization.enhancement import enhance
+    from rosafe.offline.sounds import read_ears
     from rosafe.sound.audiofile import AudioFileError
 
     try:
-        sound, rate = _sound(inputs[0], options.channels)
+        sound, rate = read_ears(inputs[0], options.channels)
         enhanced = enhance(sound, rate, options.azimuth, options.head, parameters_of(options.settings) or None)
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
     _write(target, enhanced, rate, options.force)
     return 0
-
-
-def _sound(path: str, channels: tuple[int, int] | None) -> tuple[Any, int]:
-    from rosafe.offline.sounds import open_sound
-
-    with contextlib.closing(open_sound(path, channels)) as file:
-        return file.read(file.frames), file.sample_rate
 
 
 def _write(target: Path, sound: Any, rate: int, force: bool) -> None:
@@ -81,5 +82,4 @@ def _write(target: Path, sound: Any, rate: int, force: bool) -> None:
 
     wav = io.BytesIO()
     soundfile.write(wav, sound.T.astype(np.float32), rate, format="WAV", subtype="FLOAT")
-    with new_file(target, force) as descriptor, open(descriptor, "wb", closefd=False) as file:
-        file.write(wav.getbuffer())
+    write_files({target: wav.getvalue()}, force)

@@ -13,6 +13,7 @@ from pathlib import Path
 from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._parameters import add_settings, parameters_of
+from rosafe.output import check_target
 
 _RATE = 44100
 
@@ -20,7 +21,7 @@ _RATE = 44100
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = "rosafe head learn HEAD.sofa|RECORDINGS.csv -o FILE [--rate HZ] [--set NAME=VALUE ...] [--force]"
-    parser.add_argument("action", choices=("learn",), help="what to do")
+    parser.add_argument("action", type=_action, metavar="learn", help="what to do")
     parser.add_argument("inputs", nargs="*", metavar="SOURCE", help="SOFA file, or CSV file with a list of recordings")
     parser.add_argument("-o", "--to", dest="to", metavar="FILE", required=True, help="the model")
     parser.add_argument(
@@ -38,14 +39,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _action(text: str) -> str:
+    if text != "learn":
+        raise argparse.ArgumentTypeError(f"expected learn, got {text!r}")
+    return text
+
+
 def run(options: argparse.Namespace) -> int:
     """Learn and write the model."""
     inputs = [*options.inputs, *options.more_inputs]
     if len(inputs) != 1:
-        options.usage_error(f"expected one SOFA file or one list of recordings, got {len(inputs)}")
+        options.usage_error(f"SOURCE: expected one SOFA file or one list of recordings, got {len(inputs)}")
     target = Path(options.to)
-    if target.exists() and not options.force:
-        raise CommandError(f"{target}: exists already; --force replaces it")
+    check_target(target, options.force)
     from rosafe.localization.head import Head
     from rosafe.localization.model_cache import terminal_progress
     from rosafe.localization.recordings import learn_recordings

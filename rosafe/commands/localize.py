@@ -13,7 +13,6 @@ docs/directions.md describes it."""
 from __future__ import annotations
 
 import argparse
-import contextlib
 import functools
 import importlib
 import sys
@@ -25,10 +24,11 @@ from typing import Any
 from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._parameters import add_settings, ear_channels, parameters_of
-from rosafe.output import OutputError, new_file, write_whole
+from rosafe.output import OutputError, check_target, write_files
 from rosafe.terminal import printable
 
 _SUFFIXES = (".csv", ".json", ".png")
+_TRACKS = ".tracks.csv"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -126,23 +126,21 @@ def run(options: argparse.Namespace) -> int:
     """Localize and write the results."""
     inputs = [name for name in (*options.inputs, *options.more_inputs) if ":=" not in name]
     if len(inputs) > 1:
-        options.usage_error(f"expected one sound file, got {len(inputs)}")
+        options.usage_error(f"SOUND: expected one file, got {len(inputs)}")
     return _localize(inputs[0], options) if inputs else _run_node(options)
 
 
 def _localize(path: str, options: argparse.Namespace) -> int:
     """Localize the sources in a file."""
-    targets = [Path(target) for target in options.to or ()]
-    for target in targets:
-        if target.suffix.lower() not in _SUFFIXES:
-            options.usage_error(f"-o {target}: expected a name that ends in {', '.join(_SUFFIXES)}")
+    files = _files(options)
     from rosafe.localization.localize import localize
-    from rosafe.localization.results import read_yaw
+    from rosafe.localization.results import estimates_csv, read_yaw
+    from rosafe.offline.sounds import read_ears
     from rosafe.sound.audiofile import AudioFileError
 
     try:
         yaw: Any = read_yaw(options.yaw) if options.yaw else 0.0
-        sound, rate = _sound(path, options.channels)
+        sound, rate = read_ears(path, options.channels)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             result = localize(
@@ -158,12 +156,10 @@ def _localize(path: str, options: argparse.Namespace) -> int:
     for warning in caught:
         if issubclass(warning.category, UserWarning):
             print(f"rosafe localize: {printable(warning.message)}", file=sys.stderr)
-    if not targets:
-        from rosafe.localization.results import estimates_csv
-
+    if not files:
         sys.stdout.write(estimates_csv(result))
-    for target in targets:
-        _write(target, result, options.force, path)
+    title = printable(Path(path).name)
+    write_files({file: _contents(form, result, title) for file, form in files.items()}, options.force)
     return 0
 
 
@@ -171,11 +167,11 @@ def _run_node(options: argparse.Namespace) -> int:
     """Run the node until it ends."""
     for name in ("yaw", "to", "channels", "force"):
         if getattr(options, name):
-            options.usage_error(f"expected a sound file with {'-o' if name == 'to' else '--' + name}")
+            options.usage_error(f"{'-o' if name == 'to' else '--' + name}: expected a sound file as well, got none")
     from rosafe.component import startup
 
     if options.check and options.calibrate_noise is not None:
-        options.usage_error("expected either --check or --calibrate-noise")
+        options.usage_error("--check: expected without --calibrate-noise, got both")
     try:
         given = {**vars(options), "parameters": parameters_of(options.settings) or None}
     except ValueError as problem:
@@ -225,34 +221,32 @@ def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
     return 0
 
 
-def _sound(path: str, channels: tuple[int, int] | None) -> tuple[Any, int]:
-    from rosafe.offline.sounds import open_sound
+def _files(options: argparse.Namespace) -> dict[Path, str]:
+    """Return the form of each file to write, the tables of the tracks included. Check that they can be written."""
+    files: dict[Path, str] = {}
+    for target in map(Path, options.to or ()):
+        form = target.suffix.lower()
+        if form not in _SUFFIXES:
+            options.usage_error(f"-o: expected a name that ends in {', '.join(_SUFFIXES)}, got {target}")
+        tracks = {target.with_suffix(_TRACKS): _TRACKS} if form == ".csv" else {}
+        for file, its_form in {target: form, **tracks}.items():
+            if file in files:
+                options.usage_error(f"-o: expected different files, got {file} twice")
+            check_target(file, options.force)
+            files[file] = its_form
+    return files
 
-    with contextlib.closing(open_sound(path, channels)) as file:
-        return file.read(file.frames), file.sample_rate
 
-
-def _write(target: Path, result: Mapping[str, Any], force: bool, name: str) -> None:
+def _contents(form: str, result: Mapping[str, Any], title: str) -> bytes:
+    """Return the contents of a file of `_files`."""
     from rosafe.localization import results
 
-    suffix = target.suffix.lower()
-    if suffix == ".png":
+    if form == ".png":
         from matplotlib.figure import Figure
 
-        from rosafe.view.axes import save
+        from rosafe.view.axes import png
         from rosafe.view.directions import draw
 
-        save(draw(Figure(), result, printable(Path(name).name)), target, force)
-    elif suffix == ".json":
-        _write_text(target, results.as_json(result), force)
-    else:
-        _write_text(target, results.estimates_csv(result), force)
-        _write_text(target.with_suffix(".tracks.csv"), results.tracks_csv(result), force)
-
-
-def _write_text(target: Path, text: str, force: bool) -> None:
-    if force:
-        write_whole(target, text.encode())
-        return
-    with new_file(target, False) as descriptor, open(descriptor, "wb", closefd=False) as file:
-        file.write(text.encode())
+        return png(draw(Figure(), result, title))
+    write = {".json": results.as_json, ".csv": results.estimates_csv, _TRACKS: results.tracks_csv}[form]
+    return write(result).encode()

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rosafe.commands import CommandError
+from rosafe.output import check_target
 
 if TYPE_CHECKING:
     from rosafe.validation.report import Row
@@ -46,11 +47,13 @@ def run(options: argparse.Namespace) -> int:
     """Run the comparisons and print or write their results."""
     target = Path(options.to) if options.to else None
     if target and options.self_test:
-        options.usage_error("-o: expected without --self-test, whose results the page contains as well")
+        options.usage_error("-o: expected without --self-test, whose results the page contains as well, got both")
     if target and target.suffix.lower() != ".md":
         raise CommandError(f"-o: expected a name ending in .md, got {target}")
     if target and not target.parent.is_dir():
         raise CommandError(f"{target}: expected an existing folder {target.parent}")
+    if target:
+        check_target(target, True)
     from rosafe.validation import report
 
     begin, disturbed = time.monotonic(), options.self_test

@@ -157,7 +157,9 @@ class DirectionModel:
         return model
 
     def check_tables(self) -> None:
-        """Raise ValueError if the tables do not belong together."""
+        """Raise ValueError if the tables do not belong together or to the parameters."""
+        if self.channels != self.parameters["fb_nChannels"]:
+            raise ValueError(f"tables of {self.channels} channels for {self.parameters['fb_nChannels']}")
         rows = self.channels * CLASSES
         expected = (rows * ITD_BINS + 1, len(self.azimuths)), (rows * ILD_BINS + 1, len(self.azimuths))
         if (self.itd_table.shape, self.ild_table.shape) != expected or not self.channels:

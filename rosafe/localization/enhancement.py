@@ -42,16 +42,10 @@ def direction_mask(
 
     Parameters
     ----------
-    sound : array_like, (2, N) or (N, 2)
-        Left and right ear; float, or int32 or int16, whose full scale becomes 1.
-    sample_rate : float
-        In Hz.
+    sound, sample_rate, head, parameters
+        As of `rosafe.localize`.
     azimuth : float
         Direction of the target in degrees relative to the head, left positive.
-    head : Head or str or Path
-        As of `rosafe.localize`: `"sphere"`, a head, or the path of a SOFA file or of a learned model.
-    parameters : mapping, optional
-        Of the representations, as of `rosafe.process`.
 
     Returns
     -------

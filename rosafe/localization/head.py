@@ -114,7 +114,7 @@ class Head:
 
     def filters(self, sample_rate: float) -> HeadFilters:
         """Return the filters at a sample rate (Hz)."""
-        return self._filters(_checked_rate(sample_rate))
+        return self._filters(checked_rate(sample_rate))
 
     def _make_filters(self, sample_rate: float) -> HeadFilters:
         if self._responses is None:
@@ -216,7 +216,8 @@ class Head:
         return itd, 10 * np.log10(energies[1] / energies[0])
 
 
-def _checked_rate(sample_rate: Any) -> float:
+def checked_rate(sample_rate: Any) -> float:
+    """Return a sample rate in Hz; ValueError if it is not a number within the limits."""
     if not is_number(sample_rate) or not MIN_RATE <= sample_rate <= MAX_RATE:
         raise ValueError(f"sample_rate: expected {MIN_RATE:g} to {MAX_RATE:g} Hz, got {short_repr(sample_rate)}")
     return float(sample_rate)

@@ -15,7 +15,7 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles, cues, training
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.evidence import EvidenceWindow
-from rosafe.localization.head import Head
+from rosafe.localization.head import Head, checked_rate
 from rosafe.localization.mixture import candidates
 from rosafe.localization.model_cache import model_of
 from rosafe.localization.noise import SteadyNoise
@@ -77,11 +77,9 @@ class Localizer:
         parameters: Mapping[str, Any] | None = None,
         keep_history: bool = True,
     ) -> None:
-        if not is_number(sample_rate) or sample_rate <= 0:
-            raise ValueError(f"sample_rate: expected a positive finite number in Hz, got {short_repr(sample_rate)}")
         if not is_number(seconds) or not 0 < seconds <= MAX_SECONDS:
             raise ValueError(f"seconds: expected a number above 0, at most {MAX_SECONDS:g}, got {short_repr(seconds)}")
-        self.model = find_model(head, float(sample_rate), parameters)
+        self.model = find_model(head, sample_rate, parameters)
         self.azimuths = self.model.azimuths
         self._stream = Stream(sample_rate, self.model.parameters, list(cues.KINDS))
         described = self._stream.describe()
@@ -234,7 +232,8 @@ class Localizer:
 def find_model(
     head: Any, sample_rate: float, parameters: Mapping[str, Any] | None, progress: Progress | None = None
 ) -> DirectionModel:
-    """Return the model for `Localizer`, learned if there is none yet; ValueError if `head` is unsuitable."""
+    """Return the model for `Localizer`, learned if there is none yet; ValueError if an argument is unsuitable."""
+    sample_rate = checked_rate(sample_rate)
     if isinstance(head, DirectionModel):
         return _checked_model(head, sample_rate, parameters)
     if isinstance(head, (str, os.PathLike)):

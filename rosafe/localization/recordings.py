@@ -12,6 +12,7 @@ import numpy as np
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles, training
 from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.head import checked_rate
 from rosafe.localization.results import read_recordings
 from rosafe.localization.sofa import MAX_GAP
 from rosafe.localization.training import SNR_DB, Progress
@@ -53,7 +54,7 @@ def learn_recordings(
     sounds: dict[float, list[FloatArray]] = {}
     for file, azimuth in read_recordings(path):
         with contextlib.closing(open_sound(file)) as reader:
-            sample_rate = sample_rate or reader.sample_rate
+            sample_rate = checked_rate(sample_rate or reader.sample_rate)
             if reader.sample_rate != sample_rate:
                 raise ValueError(
                     f"{printable(file)}: expected a sample rate of {sample_rate:g} Hz, got {reader.sample_rate}"

@@ -27,6 +27,7 @@ from rosafe.tree.block import Block
 from rosafe.version import VERSION
 
 OUTPUTS = ("ild", "ratemap", "crossCorrelation")  # the default: framed outputs of the original
+_MONO_ADVICE = "--channels 1,1 uses it for both, and --outputs ratemap needs one"
 _OPTIONS = ("channels", "topic", "pad", "clip")  # entries of a file that may be absent
 _TOO_LARGE = (
     "one block of output would take {taken:.1f} GB, more than the limit of {limit:.1f} GB; "
@@ -116,7 +117,7 @@ def process_file(
             return FileResult(0.0, 0, True)
         replace = True
     one_ear = outputs is not None and not any(KINDS[kind].binaural for kind in kinds)
-    with closing(open_sound(source, channels, topic, one_ear, clip)) as sound:
+    with closing(open_sound(source, channels, topic, one_ear, clip, _MONO_ADVICE)) as sound:
         if os.path.exists(target) and os.path.samefile(sound.path, target):
             raise OutputError(f"{target} is the input file")
         if sound.floats:

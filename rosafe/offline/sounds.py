@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Iterator
 from itertools import islice
@@ -49,6 +50,7 @@ def open_sound(
     topic: str | None = None,
     one_ear: bool = False,
     clip: bool = True,
+    mono_advice: str = "a direction is the difference of two ears",
 ) -> SoundReader:
     """Open a sound file or a bag.
 
@@ -64,6 +66,8 @@ def open_sound(
         Whether a mono file is accepted.
     clip : bool
         Whether samples of float files are converted to int32; see `rosafe.sound.audiofile.AudioFile`.
+    mono_advice : str
+        Appended to the error for a mono file that is not accepted.
 
     Raises
     ------
@@ -78,13 +82,18 @@ def open_sound(
             file.pick(channels)
         if file.channels != 2 and not (one_ear and file.channels == 1):
             kind = "is mono (one channel)" if file.channels == 1 else f"has {file.channels} channels"
-            mono = "--channels 1,1 uses it for both, and --outputs ratemap needs one"
-            advice = mono if file.channels == 1 else "--channels 1,2 takes the first two"
+            advice = mono_advice if file.channels == 1 else "--channels 1,2 takes the first two"
             raise AudioFileError(f"{file.path} {kind}; expected two, left and right ear ({advice})")
     except AudioFileError:
         file.close()
         raise
     return file
+
+
+def read_ears(path: str | Path, channels: tuple[int, int] | None = None) -> tuple[np.ndarray, int]:
+    """Return the sound of both ears (2, N) in a file or a bag, and its sample rate; AudioFileError as `open_sound`."""
+    with contextlib.closing(open_sound(path, channels)) as file:
+        return file.read(file.frames), file.sample_rate
 
 
 class BagSound:

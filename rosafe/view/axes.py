@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rosafe.missing import require
-from rosafe.output import new_file
+from rosafe.output import write_files
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,14 +40,17 @@ def style() -> Iterator[None]:
         yield
 
 
+def png(figure: Figure) -> bytes:
+    """Return a figure as PNG."""
+    stream = io.BytesIO()
+    with style():  # some settings apply when the figure is saved
+        figure.savefig(stream, format="png", metadata={"Software": "rosAFE"})
+    return stream.getvalue()
+
+
 def save(figure: Figure, path: Path, replace: bool = True) -> None:
     """Save a figure as PNG; an existing file is replaced if `replace`. Raise OutputError if it cannot be written."""
-    with (
-        new_file(path, replace) as descriptor,
-        os.fdopen(descriptor, "wb", closefd=False) as stream,
-        style(),  # some settings apply when the figure is saved
-    ):
-        figure.savefig(stream, format="png", metadata={"Software": "rosAFE"})
+    write_files({path: png(figure)}, replace)
 
 
 def image(axes: Axes, data: np.ndarray, extent: tuple[float, float, float, float], **options: Any) -> Any:

@@ -72,8 +72,42 @@ def test_errors_are_one_line(wav: Path, tmp_path: Path, sphere_model: Path, caps
         assert main(["localize", *arguments]) == 1
         error = capsys.readouterr().err
         assert error.startswith("rosafe localize: ") and message in error and error.count("\n") == 1
-    with pytest.raises(SystemExit):
-        main(["localize", str(wav), "-o", "out.txt"])
+        assert "--outputs" not in error and "--channels 1,1" not in error  # no direction would come of it
+    for arguments, message in (
+        (["-o", "out.txt"], "-o: expected a name that ends in .csv, .json, .png, got out.txt"),
+        (["-o", "a.csv", "-o", "a.tracks.csv"], "-o: expected different files, got a.tracks.csv twice"),
+        ([str(wav)], "SOUND: expected one file, got 2"),
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            main(["localize", str(wav), *arguments])
+        assert message in capsys.readouterr().err
+
+
+def test_targets_are_checked_before_anything_is_computed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The sound is missing as well, which would be found later."""
+    for command, suffix in (
+        (["localize", "none.wav"], "csv"),
+        (["enhance", "none.wav", "--azimuth", "0"], "wav"),
+        (["head", "learn", "none.sofa"], "head"),
+    ):
+        present = tmp_path / f"present.{suffix}"
+        present.touch()
+        for target, message in (
+            (tmp_path / "missing" / f"out.{suffix}", "missing does not exist"),
+            (present, "already exists; --force replaces it"),
+        ):
+            assert main([*command, "-o", str(target)]) == 1
+            assert message in capsys.readouterr().err
+        assert main([*command, "-o", str(tmp_path / f"new.{suffix}")]) == 1
+        assert "none." in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"present.csv", "present.wav", "present.head"}
+
+
+def test_a_csv_without_its_tracks_is_not_left(wav: Path, sphere_model: Path, tmp_path: Path) -> None:
+    (tmp_path / "out.tracks.csv").mkdir()
+    arguments = ["localize", str(wav), "--head", str(sphere_model), "-o", str(tmp_path / "out.csv"), "--force"]
+    assert main(arguments) == 1
+    assert {path.name for path in tmp_path.iterdir()} == {"sound.wav", "out.tracks.csv"}
 
 
 def test_yaw_files(tmp_path: Path) -> None:

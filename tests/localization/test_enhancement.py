@@ -127,3 +127,12 @@ def test_the_command(sphere_model: Path, tmp_path: Path, capsys: pytest.CaptureF
     for words in ([*arguments[:-1], "one.mp3"], [*arguments, "two.wav"], ["enhance", str(sound), "-o", str(out)]):
         with pytest.raises(SystemExit, match="2"):
             main(words)
+    capsys.readouterr()
+    for wrong in ("x", "nan", "400"):
+        with pytest.raises(SystemExit, match="2"):
+            main(["enhance", str(sound), "--azimuth", wrong, "-o", str(out)])
+        error = capsys.readouterr().err
+        assert f"--azimuth: expected a number of degrees from -360 to 360, got '{wrong}'" in error
+    with pytest.raises(SystemExit, match="2"):
+        main(["head", "forget", "a.sofa", "-o", "a.head"])
+    assert "learn: expected learn, got 'forget'" in capsys.readouterr().err

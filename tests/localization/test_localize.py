@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import warnings
 from pathlib import Path
@@ -178,6 +179,13 @@ def test_wrong_arguments(sphere_model: Path, change: dict[str, Any], message: st
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("rate", [1e9, 7999.0, 1e-3])
+def test_absurd_rates_are_refused_at_once(monkeypatch: pytest.MonkeyPatch, rate: float) -> None:
+    monkeypatch.setattr(training, "describe", lambda *_: pytest.fail("computed"))
+    with pytest.raises(ValueError, match=f"^sample_rate: expected 8000 to 768000 Hz, got {rate}$"):
+        rosafe.localize(np.zeros((2, 100)), rate)
+
+
 def test_a_refused_block_changes_nothing(sphere_model: Path) -> None:
     sound = modulated(0.5, 3) * np.ones((2, 1))
     localizer = rosafe.Localizer(RATE, sphere_model)
@@ -229,6 +237,15 @@ def test_damaged_models_are_one_line(tmp_path: Path, sphere_model: Path) -> None
             rosafe.Localizer(RATE, path)
         assert str(caught.value).startswith(f"{path}: expected a model of rosafe head learn, got another or a damaged")
         assert "\n" not in str(caught.value)
+    with np.load(sphere_model) as archive:
+        arrays = dict(archive)
+    description = json.loads(str(arrays["description"]))
+    for number in (30, "31", None):
+        description["parameters"]["fb_nChannels"] = number
+        with open(path, "wb") as file:
+            np.savez(file, **{**arrays, "description": np.array(json.dumps(description))})
+        with pytest.raises(ValueError, match="damaged file: 'tables of 31 channels for"):
+            rosafe.Localizer(RATE, path)
     fifo = tmp_path / "fifo.head"
     os.mkfifo(fifo)
     with pytest.raises(ValueError, match="got a FIFO"):
