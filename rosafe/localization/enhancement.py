@@ -178,9 +178,12 @@ class _Enhancer:
         step, context = (-(-round(seconds * self._rate) // hop) for seconds in (_BLOCK_SECONDS, _CONTEXT_SECONDS))
         output = np.empty((2, samples))
         for first in range(0, mask.shape[1], step):
-            begin, end = max(0, first - context), first + step + context
-            block = np.ascontiguousarray(self._view[:, begin * hop : end * hop])
+            begin, end = max(0, first - context), min(first + step, mask.shape[1]) + context
+            # silence behind the end: the response of the filters to the last samples would be missing otherwise
+            block = np.zeros((2, (end - begin) * hop), self._view.dtype)
+            block[:, : samples - begin * hop] = self._view[:, begin * hop : end * hop]
             result = process(block, self._rate, parameters=values, outputs=["gammatone"])
-            enhanced = resynthesize(result, mask[:, begin:end])
-            output[:, first * hop : (first + step) * hop] = enhanced[:, (first - begin) * hop :][:, : step * hop]
+            enhanced = resynthesize(result, mask[:, np.minimum(np.arange(begin, end), mask.shape[1] - 1)])
+            part = output[:, first * hop : (first + step) * hop]
+            part[:] = enhanced[:, (first - begin) * hop :][:, : part.shape[1]]
         return output

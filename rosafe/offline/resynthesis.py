@@ -65,8 +65,9 @@ def resynthesize(result: Result, mask: Any = None) -> FloatArray:
     -----
     The channels pass the time-reversed filters, and their sum is equalized: the least-squares solution, without delay.
     Frequencies from about half of the lowest centre frequency on are restored, up to a little above the highest one.
-    The last 10 to 20 ms are incomplete, as the response of the filters to them is not in the result; append silence if
-    they matter. Level scaling, pre-emphasis and the middle ear are compensated; DC removal and gain control are not.
+    The last 20 ms are incomplete (error -11 dB), as the response of the filters to them is not in the result. Append
+    0.1 s of silence to the sound if they matter (-50 dB). Level scaling, pre-emphasis and the middle ear are
+    compensated; DC removal and gain control are not.
 
     Examples
     --------
