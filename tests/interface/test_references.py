@@ -12,7 +12,7 @@ from rosafe.declarations.literature import DAU_1996, LITERATURE, YOUNG_2006
 from rosafe.declarations.reference import Citation, Reference
 from rosafe.interface import KINDS, citation_file, citing
 from rosafe.representations import BUILTIN
-from rosafe.version import VERSION
+from rosafe.version import AUTHORS, VERSION
 from tests.harness import ROOT
 
 DEFAULTS = {p.name: p.default for kind in KINDS.values() for p in kind.parameters}
@@ -29,6 +29,24 @@ def test_every_representation_has_references_with_valid_conditions(kind: str) ->
             choices = next(p.choices for k in KINDS.values() for p in k.parameters if p.name == name)
             for one in value if isinstance(value, tuple) else (value,):
                 assert one in choices if choices else isinstance(one, type(DEFAULTS[name])), citation
+
+
+@pytest.mark.parametrize(
+    ("file", "line"),
+    [
+        ("package.xml", r'<maintainer email="[^"]+">{}</maintainer>'),
+        ("bass/package.xml", r'<maintainer email="[^"]+">{}</maintainer>'),
+        ("pyproject.toml", r'authors = \[{{ name = "{}", email = "[^"]+" }}\]'),
+        ("debian/control", r"Maintainer: {} <[^>]+>"),
+        ("debian/copyright", r"Copyright: the {}"),
+        ("LICENSE", r"Copyright \(c\) the {}"),
+        ("docs/conf.py", r'copyright = "the {}"'),
+        ("CITATION.cff", r"- name: The {}"),
+        ("docs/citing.md", r"  author = {{{{The {}}}}},"),
+    ],
+)
+def test_all_files_name_the_authors_of_the_citation(file: str, line: str) -> None:
+    assert re.search(f"^ *{line.format(re.escape(AUTHORS))}$", (ROOT / file).read_text("utf-8"), re.MULTILINE)
 
 
 @pytest.mark.parametrize("method", ["dau", "dau1996", "breebart", "bernstein", "joergensen"])
