@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rosafe.missing import require
-from rosafe.output import write_files
+from rosafe.output import new_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,7 +50,8 @@ def png(figure: Figure) -> bytes:
 
 def save(figure: Figure, path: Path, replace: bool = True) -> None:
     """Save a figure as PNG; an existing file is replaced if `replace`. Raise OutputError if it cannot be written."""
-    write_files({path: png(figure)}, replace)
+    with new_file(path, replace) as descriptor, open(descriptor, "wb", closefd=False) as file:
+        file.write(png(figure))
 
 
 def image(axes: Axes, data: np.ndarray, extent: tuple[float, float, float, float], **options: Any) -> Any:

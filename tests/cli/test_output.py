@@ -284,3 +284,28 @@ def test_an_unknown_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(output.glob, "iglob", lambda pattern: iter(()))  # as for a process of another user
     with new_file(tmp_path / "a", replace=False), pytest.raises(OutputError, match="another process is writing it"):
         AtomicOutput(tmp_path / "a", replace=False)
+
+
+def test_files_that_belong_together_appear_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    targets = [tmp_path / name for name in ("a.csv", "b.csv")]
+    (tmp_path / "b.csv").write_text("old")
+    with pytest.raises(OutputError, match=r"b\.csv already exists; --force replaces it"):
+        output.write_files(dict.fromkeys(targets, b"new"), False)
+    with monkeypatch.context() as patch:
+        patch.setattr(output, "_write", lambda *_: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space left")))
+        with pytest.raises(OutputError, match=r"cannot write .*a\.csv: No space left"):
+            output.write_files(dict.fromkeys(targets, b"new"), True)
+    assert [path.name for path in tmp_path.iterdir()] == ["b.csv"] and targets[1].read_text() == "old"
+    output.write_files(dict.fromkeys(targets, b"new"), True)
+    assert {path.read_text() for path in targets} == {"new"} and len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_check_of_a_target_leaves_nothing(tmp_path: Path) -> None:
+    output.check_target(tmp_path / "new", False)
+    assert not list(tmp_path.iterdir())
+    for target, message in ((tmp_path / "none" / "new", "does not exist"), (tmp_path, "not a regular file")):
+        with pytest.raises(OutputError, match=message):
+            output.check_target(target, True)
+    (tmp_path / "old").write_text("old")
+    output.check_target(tmp_path / "old", True)
+    assert (tmp_path / "old").read_text() == "old"
