@@ -14,6 +14,7 @@ All of this is counted, and logged once per event.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -29,6 +30,8 @@ from rosafe.sound.windows import rows_of, split_new_frames, window_error
 
 RING_SECONDS = 10.0  # the tree may fall behind by this much before frames are lost
 OVERLAP_CHECK_FRAMES = 1000  # frames of a window that are compared with the previous window
+CURRENT_CHUNKS = 2  # a message is of a running acquisition if its newest frame is at most this old
+NEXT_MESSAGE_SECONDS = 0.25  # that a new reader waits for another message if the last one is older
 
 
 @dataclass
@@ -64,6 +67,7 @@ class AudioRing:
         self._report = report
         self._arrived = threading.Condition()  # also guards all attributes
         self._window = 0  # frames in the last message
+        self._current_until = 0.0  # s since 1970, of the last message; infinite if it has no stamp
         self._discontinuity = 1  # number of the first frame after the last one
         self._readers: list[AudioReader] = []
         self._connection: object = None
@@ -105,6 +109,8 @@ class AudioRing:
             stamp = message.stamp.sec + 1e-9 * message.stamp.nsec  # s since 1970; 0 if it is not given
             if fresh or lost:
                 self._times.add(newest, stamp or time.time())
+            chunk_seconds = message.nFramesPerChunk / message.sampleRate
+            self._current_until = stamp + CURRENT_CHUNKS * chunk_seconds if stamp else math.inf
             self._arrived.notify_all()
             now = time.monotonic()
             callbacks = []
@@ -201,15 +207,20 @@ class AudioRing:
     def open_reader(self, frames_per_block: int, timeout: float, give_up: Callable[[], bool]) -> AudioReader | None:
         """Return a reader that begins with the next frame.
 
-        Waits up to `timeout` seconds for a first message, unless `give_up()`. Returns None if there is none.
+        Waits up to `timeout` seconds for a first message, unless `give_up()`. Returns None if there is none. If the
+        last message is from an acquisition that has ended, waits a moment for another one: the first message of a new
+        acquisition, perhaps at another sample rate, may still be on its way.
         """
-        deadline = time.monotonic() + timeout
+        start = time.monotonic()
         with self._arrived:
-            while self.sample_rate == 0:
-                left = deadline - time.monotonic()
+            while self.sample_rate == 0 or time.time() > self._current_until:
+                limit = min(timeout, NEXT_MESSAGE_SECONDS) if self.sample_rate else timeout
+                left = start + limit - time.monotonic()
                 if left <= 0 or give_up():
-                    return None
+                    break
                 self._arrived.wait(min(left, 0.05))
+            if self.sample_rate == 0:
+                return None
             lag = LagMonitor(self.sample_rate, frames_per_block, self._report)
             reader = AudioReader(self, frames_per_block, self.sample_rate, self._frames.newest + 1, lag)
             self._frames.reserve(reader.required_frames)

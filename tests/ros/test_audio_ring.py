@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -350,6 +351,29 @@ def test_waiting_for_the_first_message() -> None:
     feed(Source(index=7).message())
     waiting.join(PATIENCE)
     assert found[0].position == 8 and found[0].sample_rate == RATE
+
+
+def test_the_first_message_of_a_new_acquisition_may_still_be_on_its_way() -> None:
+    """The sample rate of a tree is that of the new acquisition, not of the one that has ended."""
+    ring = AudioRing(lambda line: None)
+    feed = ring.connect()
+
+    def arrives() -> bool:
+        feed(Source(rate=2 * RATE, number=2).message())
+        return False
+
+    ended = Source(index=50).message()
+    ended.stamp = SimpleNamespace(sec=1_000_000_000, nsec=0)
+    feed(ended)
+    without = ring.open_reader(4, 60.0, lambda: False)
+    assert without is not None and without.sample_rate == RATE, "no other message arrives"
+    reader = ring.open_reader(4, 60.0, arrives)
+    assert reader is not None and reader.sample_rate == 2 * RATE
+    running = Source(rate=RATE, index=50).message()
+    running.stamp = SimpleNamespace(sec=int(time.time()) + 60, nsec=0)
+    feed(running)
+    reader = ring.open_reader(4, 60.0, arrives)
+    assert reader is not None and reader.sample_rate == RATE, "of a running acquisition: no wait"
 
 
 def test_a_reader_is_notified_of_each_complete_block_until_it_is_stopped() -> None:
