@@ -73,6 +73,7 @@ class Graph:
 
     async def close(self) -> None:
         """Leave the graph."""
+        self.gone.set()  # otherwise `join` may try again, without a session
         if self._node is not None:
             self._node.cancel()
         if self.is_node:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import signal
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import pytest
 import rosgraph
 
+from rosafe.client import graph as client_graph
 from tests.genomix.world import Http
-from tests.harness import END_SECONDS, Graph, free_port, private_graph, wait_for
+from tests.harness import END_SECONDS, PATIENCE, Graph, free_port, private_graph, wait_for
 
 
 def registrations(graph: Graph, node: str) -> int:
@@ -37,6 +40,21 @@ def test_it_leaves_the_graph_with_all_its_registrations(graph: Graph) -> None:
         assert server.stop(signal.SIGTERM, timeout=END_SECONDS) == 0
         wait_for(lambda: not registrations(graph, "/genomixd"), 1.5)
         assert not known(graph, "/genomixd")
+
+
+def test_no_attempt_to_join_after_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If there is no master, attempts are repeated; the end may come between two of them."""
+    monkeypatch.setattr(client_graph, "JOIN_SECONDS", 0.2)
+
+    async def check() -> None:
+        graph = client_graph.Graph(f"http://127.0.0.1:{free_port()}")
+        joining = asyncio.create_task(graph.join())
+        await asyncio.sleep(0)  # it begins
+        await asyncio.wait({graph.prepare()})
+        await graph.close()
+        await asyncio.wait_for(joining, PATIENCE)
+
+    asyncio.run(check())
 
 
 def test_names(graph: Graph) -> None:
