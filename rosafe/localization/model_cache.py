@@ -36,6 +36,7 @@ def model_of(
 
     A cache that cannot be read or written is ignored.
     """
+    sample_rate = float(sample_rate)  # 44100 and 44100.0 have the same model
     described = training.describe(sample_rate, parameters)
     values = training.model_parameters(described)
     text = json.dumps([FORMAT, VERSION, head.key, sample_rate, values], sort_keys=True)

@@ -217,6 +217,8 @@ def test_models_are_cached_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert len(files) == 1
     monkeypatch.setattr(model_cache, "learn_head", lambda *_: pytest.fail("learned again"))
     _equal(first, rosafe.localize(sound, 8000, rosafe.Head.sphere()))
+    for sample_rate in (8000, 8000.0):
+        model_cache.model_of(rosafe.Head.sphere(), sample_rate, None)
     monkeypatch.undo()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(training, "SOUND_SECONDS", 20.0)
@@ -224,6 +226,13 @@ def test_models_are_cached_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         files[0].write_bytes(damaged)
         _equal(first, rosafe.localize(sound, 8000, rosafe.Head.sphere()))
         assert files[0].stat().st_size > 10**6
+
+
+def test_a_cache_that_cannot_be_written_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null/none")
+    monkeypatch.setattr(training, "SOUND_SECONDS", 20.0)
+    sound = np.random.default_rng(1).standard_normal((2, 4000)) * 0.1
+    assert len(rosafe.localize(sound, 8000, rosafe.Head.sphere())["time"])
 
 
 def test_damaged_models_are_one_line(tmp_path: Path, sphere_model: Path) -> None:
