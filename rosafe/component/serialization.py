@@ -48,6 +48,7 @@ class ByteSink(Protocol):
 # --- writing ----------------------------------------------------------------------------------------------------
 
 
+@functools.lru_cache(maxsize=256)  # messages of a port have few shapes, and numpy takes longer than for the samples
 def nested_dtype(shape: tuple[int, ...]) -> np.dtype:
     """Return the wire layout of a signal of regular `shape`: at every level a uint32 count, then the elements."""
     layout = _SAMPLES["double"]

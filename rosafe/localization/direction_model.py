@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from rosafe.declarations.text import short_repr
+from rosafe.dsp import kernels
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.input import open_regular
 from rosafe.localization import angles
@@ -31,6 +32,7 @@ from rosafe.localization.cues import (
     ILD_BINS,
     ITD_BINS,
     LEVEL_CLASSES,
+    LEVEL_STEP,
     Cues,
     floors,
     level_class,
@@ -87,6 +89,9 @@ class DirectionModel:
         # Half precision, as in files, so that a learned and a loaded model give the same numbers.
         self.itd_table = np.asarray(itd_table, np.float16).astype(np.float32)
         self.ild_table = np.asarray(ild_table, np.float16).astype(np.float32)
+        self._tables = kernels.EvidenceTables(
+            self.itd_table, self.ild_table, ITD_BINS, ILD_BINS, LEVEL_CLASSES, LEVEL_STEP
+        )
 
     @property
     def channels(self) -> int:
@@ -104,10 +109,33 @@ class DirectionModel:
         """Return log-likelihood ratios (F, C, A) for the rows (F, C) of `rows`."""
         return self.itd_table[itd_row] + self.ild_table[ild_row]
 
-    def sum_of(self, itd_row: NDArray[np.intp], ild_row: NDArray[np.intp]) -> FloatArray:
-        """Return the sum (C, A) of `terms` over frames."""
-        itd = self.itd_table[itd_row].sum(axis=0, dtype=np.float64)
-        return np.asarray(itd + self.ild_table[ild_row].sum(axis=0, dtype=np.float64))
+    def add_evidence(
+        self,
+        sums: FloatArray,
+        cues: Cues,
+        floor: FloatArray,
+        frames: NDArray[np.intp],
+        channels: NDArray[np.bool_],
+        factor: float = 1.0,
+    ) -> None:
+        """Add `terms` of some frames (n,) for some channels (C,), times `factor`, to `sums` (C, A).
+
+        Sums are exact: the tables have half precision.
+        """
+        if kernels.compiled():
+            self._tables.add(sums, cues, floor, frames, channels, factor)
+        else:
+            itd_row, ild_row = (rows[:, channels] for rows in self.rows(cues.select(frames), floor))
+            itd = self.itd_table[itd_row].sum(axis=0, dtype=np.float64)
+            sums[channels] += factor * (itd + self.ild_table[ild_row].sum(axis=0, dtype=np.float64))
+
+    def unit_evidence(self, cues: Cues, floor: FloatArray, frames: NDArray[np.intp]) -> NDArray[np.float32]:
+        """Return `terms` (U, A) of each channel with cues of some frames (n,)."""
+        valid = cues.valid[frames]
+        if kernels.compiled():
+            return self._tables.units(cues, floor, frames, int(np.count_nonzero(valid)))
+        itd_row, ild_row = self.rows(cues.select(frames), floor)
+        return self.terms(itd_row[valid], ild_row[valid])
 
     # --- files ---
 

@@ -38,10 +38,12 @@ class EvidenceWindow:
             np.zeros((frames, channels)),
             np.zeros((frames, channels), bool),
         )
+        self._powers = np.zeros((frames, channels))  # of the levels of the cues
         self._yaw = np.zeros(frames)
         self._power = np.zeros(frames)
         self._sums = np.zeros((channels, len(model.azimuths)))  # of all frames, world coordinates
         self._floor = np.full(channels, np.nan)
+        self._all = np.ones(channels, bool)
         self._count = 0  # frames since the start
 
     @property
@@ -59,33 +61,35 @@ class EvidenceWindow:
         few = 2 * len(yaw) < self.filled  # otherwise it is faster to begin again
         replaced = places[positions >= self._frames]
         if few and len(replaced):
-            self._sums -= self._evidence(replaced)
+            self._add_evidence(replaced, self._all, -1.0)
         self._count += len(yaw)
         for kept, new in zip(self._cues, cues, strict=True):
             kept[places] = new
+        self._powers[places] = 10 ** (cues.level / 10)
         self._yaw[places] = yaw
         self._power[places] = power
         floor = floors(self._cues.level[: self.filled])
-        changed = (floor != self._floor) | (not few)
+        same = (floor == self._floor) & few
         self._floor = floor
         if few:
-            self._sums += self._evidence(places)
-        if changed.any():
-            self._sums[changed] = self._evidence(slice(0, self.filled), changed)
+            self._add_evidence(places, same)
+        if not same.all():
+            self._sums[~same] = 0.0
+            self._add_evidence(np.arange(self.filled), ~same)
 
-    def _evidence(self, frames: Any, channels: Any = slice(None)) -> FloatArray:
-        """Return the evidence (C, A) of frames in world coordinates."""
-        cues = self._cues.select(frames)
-        itd_row, ild_row = self._model.rows(cues, self._floor)
-        itd_row, ild_row = itd_row[:, channels], ild_row[:, channels]
+    def _add_evidence(self, frames: NDArray[np.intp], channels: NDArray[np.bool_], factor: float = 1.0) -> None:
+        """Add the evidence of frames for some channels (C,), times `factor`, to the sums in world coordinates."""
         yaw = self._yaw[frames]
-        if np.all(yaw == yaw[0]):
-            total = self._model.sum_of(itd_row, ild_row)
-            return rotate(total, np.full(len(total), yaw[0]))
-        evidence = self._model.terms(itd_row, ild_row)
-        shape = evidence.shape
-        turned = rotate(evidence.reshape(-1, shape[-1]), np.repeat(yaw, shape[1]))
-        return np.asarray(turned.reshape(shape).sum(axis=0, dtype=np.float64))
+        if not yaw.any():
+            self._model.add_evidence(self._sums, self._cues, self._floor, frames, channels, factor)
+        elif (yaw == yaw[0]).all():
+            total = np.zeros_like(self._sums)
+            self._model.add_evidence(total, self._cues, self._floor, frames, channels, factor)
+            self._sums[channels] += rotate(total, np.full(len(total), yaw[0]))[channels]
+        else:
+            evidence = self._model.terms(*self._model.rows(self._cues.select(frames), self._floor))[:, channels]
+            turned = rotate(evidence.reshape(-1, evidence.shape[-1]), np.repeat(yaw, evidence.shape[1]))
+            self._sums[channels] += factor * turned.reshape(evidence.shape).sum(axis=0, dtype=np.float64)
 
     def count_units(self) -> int:
         """Return the number of frames of all channels that have cues."""
@@ -101,8 +105,7 @@ class EvidenceWindow:
 
     def level(self, frames: int) -> FloatArray:
         """Return the mean level (C,) of the last `frames` frames in dB."""
-        power = 10 ** (self._cues.level[self._last(frames)] / 10)
-        return np.asarray(10 * np.log10(power.mean(axis=0)))
+        return np.asarray(10 * np.log10(self._powers[self._last(frames)].mean(axis=0)))
 
     def _last(self, frames: int) -> NDArray[np.intp]:
         """Return the places of the last `frames` frames, of fewer if there are fewer."""
@@ -116,12 +119,11 @@ class EvidenceWindow:
         their level exceeds that of `noise` (C,) in dB.
         """
         places = self._last(frames)
-        cues = self._cues.select(places)
-        itd_row, ild_row = self._model.rows(cues, self._floor)
-        yaw = np.broadcast_to(self._yaw[places, np.newaxis], cues.valid.shape)[cues.valid]
-        evidence = rotate(self._model.terms(itd_row[cues.valid], ild_row[cues.valid]), yaw)
-        powers = 10 ** (cues.level[cues.valid] / 10) / max(1, len(places))
-        return evidence, powers, (cues.level > noise)[cues.valid]
+        valid = self._cues.valid[places]
+        evidence = self._model.unit_evidence(self._cues, self._floor, places)
+        if (yaw := self._yaw[places]).any():
+            evidence = rotate(evidence, np.broadcast_to(yaw[:, np.newaxis], valid.shape)[valid])
+        return evidence, self._powers[places][valid] / max(1, len(places)), (self._cues.level[places] > noise)[valid]
 
 
 def rotate(evidence: NDArray[Any], yaw: FloatArray) -> NDArray[Any]:

@@ -57,7 +57,8 @@ class Mixture(NamedTuple):
 
     def part_of(self, directions: NDArray[np.bool_]) -> FloatArray:
         """Return the part (U,) of each unit that these directions (A,) explain."""
-        return np.asarray((self.likelihood @ np.where(directions, self.weights, 0.0)) * self.inverse)
+        few = np.flatnonzero(directions)  # the likelihood of others is not converted to float64
+        return np.asarray((self.likelihood[:, few] @ self.weights[few]) * self.inverse)
 
 
 def fit(evidence: FloatArray) -> Mixture:
@@ -67,7 +68,7 @@ def fit(evidence: FloatArray) -> Mixture:
     count = likelihood.shape[1]
     weight = np.full(count + 1, 0.9 / count, np.float32)
     weight[-1] = 0.1  # of units without a direction
-    compiled = count == kernels.MIXTURE_COMPONENTS and kernels.compiled()
+    compiled = count == kernels.DIRECTIONS and kernels.compiled()
     inverse = (kernels.mixture if compiled else fit_by_numpy)(likelihood, ITERATIONS, weight)
     return Mixture(weight[:-1].astype(np.float64), likelihood, inverse)
 

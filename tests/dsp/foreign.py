@@ -154,7 +154,8 @@ def _addresses(kinds: Sequence[Any], values: Sequence[Any]) -> Iterator[int]:
 def _members(packed: bytes) -> tuple[Sequence[Any], Sequence[int]]:
     """Return the types and values of a struct argument."""
     kinds = {"P": ctypes.c_void_p, "q": ctypes.c_int64}
-    return [kinds[letter] for letter in loader.FRAMES], struct.unpack(loader.FRAMES, packed)
+    form = loader.FRAMES if len(packed) == struct.calcsize(loader.FRAMES) else loader.CUES
+    return [kinds[letter] for letter in form], struct.unpack(form, packed)
 
 
 def _argument(kind: Any, value: Any, spans: list[tuple[int, int]]) -> bytes:

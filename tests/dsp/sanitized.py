@@ -157,10 +157,23 @@ def fuzz(cases: int) -> None:
         pieces = [rng.standard_normal((*rows, int(n))) for n in rng.integers(0, 40, rng.integers(1, 5))]
         whole = np.empty((*rows, sum(piece.shape[-1] for piece in pieces)))
         kernels.concatenate(pieces, whole)
-        likelihood = rng.random((int(rng.integers(0, 40)), kernels.MIXTURE_COMPONENTS), np.float32)
-        kernels.mixture(likelihood, 3, np.full(kernels.MIXTURE_COMPONENTS + 1, 0.01, np.float32)).sum()
+        likelihood = rng.random((int(rng.integers(0, 40)), kernels.DIRECTIONS), np.float32)
+        kernels.mixture(likelihood, 3, np.full(kernels.DIRECTIONS + 1, 0.01, np.float32)).sum()
+        evidence(rng, *rng.integers(1, 9, 2))
     assert all(done.values()), f"kinds without a processed block: {[kind for kind in done if not done[kind]]}"
     print(f"{sum(done.values())} blocks, {refused} refusals, {time.process_time():.0f} s", flush=True)
+
+
+def evidence(rng: np.random.Generator, frames: int, channels: int) -> None:
+    """Look up cues in tables of one row for each channel and class."""
+    tables = [rng.random((3 * channels, kernels.DIRECTIONS)).astype(np.float32) for _ in range(2)]
+    tables_of = kernels.EvidenceTables(tables[0], tables[1], 1, 1, 3, 2.0)
+    rows = np.tile(3 * np.arange(channels), (frames, 1))
+    valid = rng.random(rows.shape) < 0.5
+    cues = rows, rows.copy(), rng.uniform(-5, 10, rows.shape), valid
+    sums, floor, all_frames = np.zeros((channels, kernels.DIRECTIONS)), np.zeros(channels), np.arange(frames)
+    tables_of.add(sums, cues, floor, all_frames, rng.random(channels) < 0.5, -1.0)
+    tables_of.units(cues, floor, all_frames, int(valid.sum())).sum()
 
 
 def overflow() -> None:

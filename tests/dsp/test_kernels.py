@@ -23,7 +23,9 @@ from rosafe.dsp.numeric_limits import LIMIT
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.dsp.windows import NAMES
-from rosafe.localization import mixture
+from rosafe.localization import cues, mixture
+from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.evidence import EvidenceWindow
 from rosafe.representations import STAGES, precedence
 from rosafe.representations.amsfeatures import AmsFeatures
 from rosafe.representations.crosscorrelation import CrossCorrelation
@@ -536,12 +538,55 @@ def test_the_processor_check_uses_no_newer_instructions() -> None:
     assert not newer
 
 
+def direction_model(channels: int, rng: np.random.Generator) -> DirectionModel:
+    """Return a model with random tables."""
+    description = {"sample_rate": RATE, "parameters": {}, "head": "", "is_sphere": True, "level_gain_db": 0.0}
+    rows = channels * cues.CLASSES
+    tables = [rng.normal(0, 1, (rows * bins + 1, kernels.DIRECTIONS)) for bins in (cues.ITD_BINS, cues.ILD_BINS)]
+    for table in tables:
+        table[-1] = 0.0
+    return DirectionModel(description, *tables)
+
+
+def random_cues(frames: int, channels: int, rng: np.random.Generator) -> cues.Cues:
+    """Return cues with levels on both sides of those of all classes, and on their limits."""
+    first = np.arange(channels) * cues.CLASSES + cues.LEVEL_CLASSES * rng.integers(
+        0, cues.COHERENCE_CLASSES, (frames, channels)
+    )
+    return cues.Cues(
+        first * cues.ITD_BINS + rng.integers(0, cues.ITD_BINS, first.shape),
+        first * cues.ILD_BINS + rng.integers(0, cues.ILD_BINS, first.shape),
+        np.round(rng.uniform(-60, -30, first.shape)),
+        rng.random(first.shape) < 0.7,
+    )
+
+
+@each_level
+@pytest.mark.parametrize("yaw", [0.0, 37.0, None])
+def test_evidence(yaw: float | None, level: Choice) -> None:
+    """The sums and the evidence of units are equal to the last bit, with parts of all sizes."""
+    rng = np.random.default_rng(1)
+    model = direction_model(5, rng)
+    both = EvidenceWindow(model, 50), EvidenceWindow(model, 50)
+    for frames in [1, 1, 3, 10, 10, 30, 10, 1, 10, 60, 10]:
+        new = random_cues(frames, 5, rng)
+        turned = rng.uniform(-180, 180, frames) if yaw is None else np.full(frames, yaw)
+        results = []
+        for window, choice in zip(both, (level, NUMPY), strict=True):
+            with using(choice):
+                window.extend(new, np.ones(frames), turned)
+                results.append((window.sums(), *window.units(20, np.full(5, -40.0))))
+        for got, expected in zip(*results, strict=True):
+            np.testing.assert_array_equal(got, expected)
+    assert np.abs(both[0].sums()).max() > 1
+
+
 @each_level
 @pytest.mark.parametrize("units", [1, 60, 1550])
 def test_mixture(units: int, level: Choice) -> None:
     rng = np.random.default_rng(units)
-    likelihood = np.exp(rng.normal(0, 2, (units, kernels.MIXTURE_COMPONENTS))).astype(np.float32)
-    start = rng.uniform(0.5, 1.0, kernels.MIXTURE_COMPONENTS + 1).astype(np.float32)
+    likelihood = np.exp(rng.normal(0, 2, (units, kernels.DIRECTIONS))).astype(np.float32)
+    start = rng.uniform(0.5, 1.0, kernels.DIRECTIONS + 1).astype(np.float32)
     start /= start.sum()
     got, expected = start.copy(), start.copy()
     with using(level):

@@ -4,7 +4,8 @@ A stage calls its kernel if `compiled()` is True, otherwise the equivalent: with
 if the environment variable ROSAFE_KERNELS is 0. Both use the same states and agree to 1e-11 of the largest number.
 Tests compare each kernel with its equivalent, which is the reference. Kernels release the GIL.
 
-All arrays are of float64 or complex128 (those of a mixture of float32), and C-contiguous unless stated otherwise.
+All arrays are of float64 or complex128 (those of a mixture and tables of evidence of float32), and C-contiguous unless
+stated otherwise.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from rosafe.dsp import buffer_pool
 
-from .loader import FRAMES, Status, loaded
+from .loader import CUES, FRAMES, Status, loaded
 
 FloatArray = NDArray[np.float64]
 
@@ -35,7 +36,8 @@ MAX_POINTS = 8192  # real points of a Fourier transform
 
 REAL_SIZE = 8  # bytes of a float64
 _pack = struct.Struct(FRAMES).pack
-MIXTURE_COMPONENTS = 72
+_pack_cues = struct.Struct(CUES).pack
+DIRECTIONS = 72  # of a mixture and of evidence
 MAX_LANES = 8  # float64 in a register
 
 CLIPPINGS = ("clp", "clc", "sgn")
@@ -410,11 +412,60 @@ def concatenate(blocks: Sequence[FloatArray], whole: FloatArray) -> None:
 
 
 def mixture(likelihood: NDArray[np.float32], iterations: int, weights: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Compute the same as `rosafe.localization.mixture.fit_by_numpy`, for `MIXTURE_COMPONENTS` components."""
+    """Compute the same as `rosafe.localization.mixture.fit_by_numpy`, for `DIRECTIONS` directions."""
     inverse = np.empty(len(likelihood), np.float32)
     likelihood = np.ascontiguousarray(likelihood)
     _function("rosafe_mixture")(len(likelihood), _address(likelihood), iterations, _address(weights), _address(inverse))
     return inverse
+
+
+class EvidenceTables(NamedTuple):
+    """Look-up of cues, as `rosafe.localization.direction_model.DirectionModel` with its tables of `DIRECTIONS` columns.
+
+    `itd_bins`, `ild_bins` rows of the tables belong to each of `classes` of levels, which are `step` dB apart.
+    """
+
+    itd: NDArray[np.float32]
+    ild: NDArray[np.float32]
+    itd_bins: int
+    ild_bins: int
+    classes: int
+    step: float
+
+    def _packed(self, cues: Sequence[NDArray[Any]], floor: FloatArray) -> bytes:
+        """Return the argument `cues` of kernels: see `Cues` of rosafe/localization/cues.py; the floor is (C,)."""
+        itd_row, ild_row, level, valid = cues
+        arrays = map(_address, (itd_row, ild_row, level, valid, floor, self.itd, self.ild))
+        return _pack_cues(len(floor), *arrays, *self[2:5])
+
+    def add(
+        self,
+        sums: FloatArray,
+        cues: Sequence[NDArray[Any]],
+        floor: FloatArray,
+        frames: NDArray[np.int64],
+        channels: NDArray[np.bool_],
+        factor: float,
+    ) -> None:
+        """Add the evidence of frames (n,) for some channels (C,), times `factor`, to `sums` (C, A)."""
+        _function("rosafe_add_evidence")(
+            self._packed(cues, floor),
+            self.step,
+            _address(frames),
+            len(frames),
+            _address(channels),
+            factor,
+            _address(sums),
+        )
+
+    def units(
+        self, cues: Sequence[NDArray[Any]], floor: FloatArray, frames: NDArray[np.int64], number: int
+    ) -> NDArray[np.float32]:
+        """Return the evidence (number, A) of each channel with cues of frames (n,)."""
+        evidence = np.empty((number, DIRECTIONS), np.float32)
+        packed = self._packed(cues, floor)
+        _function("rosafe_unit_evidence")(packed, self.step, _address(frames), len(frames), _address(evidence))
+        return evidence
 
 
 @contextmanager
