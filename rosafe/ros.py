@@ -96,7 +96,11 @@ class FrameClock:
         with self._arrived:
             if not self._lines:
                 raise LookupError(f"no message on {self.topic} yet; check that there is an input and sound")
-            line = next((line for line in self._lines if line.frame >= frame), self._lines[-1])
+            line = self._lines[-1]
+            for older in reversed(self._lines):  # mostly one of the last is sought
+                if older.frame < frame:
+                    break
+                line = older
         wall = line.wall + (frame - line.frame) / line.rate
         return Moment(wall, self._rospy.Time.from_sec(max(0.0, wall + line.offset)))
 

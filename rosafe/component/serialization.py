@@ -196,7 +196,7 @@ def _read_signal(reader: _Reader, levels: int) -> np.ndarray | list[Any]:
         level = np.frombuffer(reader.take(size), nested_dtype(tuple(shape)))
         regular = True
         for length in shape:
-            regular = regular and bool(np.all(level["n"] == length))
+            regular = regular and bool((level["n"] == length).all())
             level = level["d"]
         if regular:
             return np.asarray(level[0])

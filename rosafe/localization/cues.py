@@ -60,7 +60,7 @@ def quantize(features: Mapping[str, Any], gain_db: float) -> Cues:
 
 def _bin(values: FloatArray, count: int) -> NDArray[np.intp]:
     """Return the bin of values from 0 to 1; those outside belong to the first or the last one."""
-    return np.clip(np.floor(values * count), 0, count - 1).astype(np.intp)
+    return np.minimum(np.maximum(np.floor(values * count), 0), count - 1).astype(np.intp)
 
 
 def floors(levels: FloatArray) -> FloatArray:
@@ -71,7 +71,8 @@ def floors(levels: FloatArray) -> FloatArray:
 
 def level_class(level: FloatArray, floor: FloatArray) -> NDArray[np.intp]:
     """Return the class of levels (..., C) above a floor (C,)."""
-    return np.clip(np.floor((level - floor) / LEVEL_STEP), 0, LEVEL_CLASSES - 1).astype(np.intp)
+    steps = np.floor((level - floor) / LEVEL_STEP)
+    return np.minimum(np.maximum(steps, 0), LEVEL_CLASSES - 1).astype(np.intp)
 
 
 def check_features(features: Mapping[str, Any], channels: int) -> dict[str, FloatArray]:

@@ -64,7 +64,9 @@ class Mixture(NamedTuple):
 def fit(evidence: FloatArray) -> Mixture:
     """Return the mixture for the evidence (U, A) of units."""
     likelihood = np.float32(SHARPNESS) * evidence.astype(np.float32, copy=False)
-    np.exp(np.clip(likelihood, -_LIMIT, _LIMIT, out=likelihood), out=likelihood)
+    np.minimum(likelihood, _LIMIT, out=likelihood)  # with the next line: several times as fast as np.clip
+    np.maximum(likelihood, -_LIMIT, out=likelihood)
+    np.exp(likelihood, out=likelihood)
     count = likelihood.shape[1]
     weight = np.full(count + 1, 0.9 / count, np.float32)
     weight[-1] = 0.1  # of units without a direction

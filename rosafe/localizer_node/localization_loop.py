@@ -165,7 +165,8 @@ class LocalizationLoop:
             self._begin_again()
             return False
         middles = np.maximum.accumulate(middles)
-        result = localizer.update(used.frames.features, middles, np.stack((middles, used.yaw), axis=1), last_only=True)
+        yaw = np.stack((middles, used.yaw), axis=1) if used.yaw.any() else 0.0
+        result = localizer.update(used.frames.features, middles, yaw, last_only=True)
         steady = ", ".join(f"{azimuth:.0f}" for azimuth in localizer.noise.azimuths)
         self._status.value("directions of steady noise (degrees)", steady or "none")
         self._estimate = result["azimuths"], result["posterior"][0]
