@@ -24,6 +24,7 @@ from typing import Any
 from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._parameters import add_settings, ear_channels, parameters_of
+from rosafe.missing import require
 from rosafe.output import OutputError, check_target, write_files
 from rosafe.terminal import printable
 
@@ -228,6 +229,8 @@ def _files(options: argparse.Namespace) -> dict[Path, str]:
         form = target.suffix.lower()
         if form not in _SUFFIXES:
             options.usage_error(f"-o: expected a name that ends in {', '.join(_SUFFIXES)}, got {target}")
+        if form == ".png":
+            require("matplotlib", "pictures")
         tracks = {target.with_suffix(_TRACKS): _TRACKS} if form == ".csv" else {}
         for file, its_form in {target: form, **tracks}.items():
             if file in files:

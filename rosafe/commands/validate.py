@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rosafe.commands import CommandError
+from rosafe.missing import require
 from rosafe.output import check_target
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ def run(options: argparse.Namespace) -> int:
         raise CommandError(f"{target}: expected an existing folder {target.parent}")
     if target:
         check_target(target, True)
+        require("matplotlib", "pictures")
     from rosafe.validation import report
 
     begin, disturbed = time.monotonic(), options.self_test

@@ -42,10 +42,12 @@ def direction_mask(
 
     Parameters
     ----------
-    sound, sample_rate, head, parameters
+    sound, sample_rate
         As of `rosafe.localize`.
     azimuth : float
         Direction of the target in degrees relative to the head, left positive.
+    head, parameters
+        As of `rosafe.localize`.
 
     Returns
     -------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,17 @@ def test_targets_are_checked_before_anything_is_computed(tmp_path: Path, capsys:
         assert main([*command, "-o", str(tmp_path / f"new.{suffix}")]) == 1
         assert "none." in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"present.csv", "present.wav", "present.head"}
+
+
+@pytest.mark.parametrize("words", [["localize", "none.wav", "-o", "new.png"], ["validate", "-o", "new.md"]])
+def test_pictures_need_matplotlib_before_anything_is_computed(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 1
+    output, error = capsys.readouterr()
+    assert "matplotlib is not installed" in error and not output and not list(tmp_path.iterdir())
 
 
 def test_a_csv_without_its_tracks_is_not_left(wav: Path, sphere_model: Path, tmp_path: Path) -> None:
