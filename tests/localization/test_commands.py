@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -108,7 +108,7 @@ def test_targets_are_checked_before_anything_is_computed(tmp_path: Path, capsys:
 def test_pictures_need_matplotlib_before_anything_is_computed(
     words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(cast(dict[str, object], sys.modules), "matplotlib", None)
     monkeypatch.chdir(tmp_path)
     assert main(words) == 1
     output, error = capsys.readouterr()
