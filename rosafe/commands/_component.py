@@ -40,12 +40,21 @@ def prepare(wait: float = 0.0) -> None:
 
 
 @asynccontextmanager
-async def component(instance: str, wait: float = 0.0) -> AsyncIterator[ComponentClient]:
-    """Provide a client of the rosAFE node `instance`. Raises CommandError if there is none within `wait` seconds."""
+async def open_graph() -> AsyncIterator[Graph]:
+    """Provide the graph of the master of this environment."""
     from rosafe.client.graph import Graph
 
     graph = Graph(os.environ["ROS_MASTER_URI"])
     try:
+        yield graph
+    finally:
+        await graph.close()
+
+
+@asynccontextmanager
+async def component(instance: str, wait: float = 0.0) -> AsyncIterator[ComponentClient]:
+    """Provide a client of the rosAFE node `instance`. Raises CommandError if there is none within `wait` seconds."""
+    async with open_graph() as graph:
         try:
             client = await _find(graph, instance, wait)
         except ComponentError as problem:
@@ -56,8 +65,6 @@ async def component(instance: str, wait: float = 0.0) -> AsyncIterator[Component
             yield client
         finally:
             await client.close()
-    finally:
-        await graph.close()
 
 
 async def _find(graph: Graph, instance: str, wait: float) -> ComponentClient:

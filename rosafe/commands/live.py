@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import os
 
 from rosafe import option_types
 from rosafe.commands import CommandError
+from rosafe.commands._component import prepare
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -42,16 +42,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
-    from rosafe.component import generate, startup
+    from rosafe.component import startup
     from rosafe.interface import ComponentError
-    from rosafe.transport import master
 
-    master.set_local_defaults()
-    try:
-        generate.ensure_messages()
-        master.check_master(os.environ["ROS_MASTER_URI"])
-    except (generate.GenerationError, master.MasterError) as problem:
-        raise CommandError(str(problem)) from None
+    prepare()
     startup.ensure_log_directory()
     from rosafe.client.component_client import names  # needs the messages
     from rosafe.http_server.listener import ListenError

@@ -10,19 +10,18 @@ import asyncio
 import os
 import shutil
 import sys
-from collections.abc import AsyncIterator, Iterable
-from contextlib import asynccontextmanager
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from rosafe import option_types
 from rosafe.commands import CommandError
+from rosafe.commands._component import format_error, open_graph
 from rosafe.interface import ComponentError
 from rosafe.setups import AcquireSettings, Setup
 
 if TYPE_CHECKING:
     from rosafe.client.component_client import ComponentClient
-    from rosafe.client.graph import Graph
     from rosafe.commands._launcher import Launcher, ManagedProcess
 
 POLL_SECONDS = 1.0  # between two queries of the state of all nodes
@@ -146,7 +145,7 @@ class _Session:
     async def _work(self) -> None:
         options, stack = self._options, self._stack
         await stack.start_master()
-        async with _graph() as graph:
+        async with open_graph() as graph:
             keep = ("--keep", options.keep) if options.keep else ()
             bass, afe, _ = await asyncio.gather(
                 stack.start_node(graph, "bass"),
@@ -165,7 +164,6 @@ class _Session:
 
     async def _load(self, afe: ComponentClient | None) -> None:
         from rosafe.client import setup_transaction
-        from rosafe.commands._component import format_error
         from rosafe.commands._launcher import ManagedProcess
 
         if self._setup is None:
@@ -207,17 +205,6 @@ async def _acquisition(bass: ComponentClient) -> str:
 async def _tree(afe: ComponentClient) -> str:
     processors = (await afe.outputs("getProcessors", {}))["processors"]
     return f"{len(processors)} processors"
-
-
-@asynccontextmanager
-async def _graph() -> AsyncIterator[Graph]:
-    from rosafe.client.graph import Graph
-
-    graph = Graph(os.environ["ROS_MASTER_URI"])
-    try:
-        yield graph
-    finally:
-        await graph.close()
 
 
 class _Screen:

@@ -10,9 +10,9 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NoReturn
 
 from rosafe import option_types
+from rosafe.component.startup import Parser
 from rosafe.terminal import printable
 
 DEFAULT_DEVICE = "scene:"
@@ -61,11 +61,6 @@ class _Signals:
         self.received = self.received or number
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"demo: {message}; run scripts/demo -h for the options\n")
-
-
 def _sound(text: str) -> str:
     if not text.strip():
         raise argparse.ArgumentTypeError(
@@ -108,7 +103,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run `scripts/demo` and return its exit code, as `run`. SystemExit: 2 for a wrong command line, 0 after -h."""
-    parser = _Parser(
+    parser = Parser(
         prog="scripts/demo",
         description="Process audio into seven auditory representations on ROS topics, and save a figure of them.",
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import os
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO, TextIOWrapper
@@ -159,9 +159,7 @@ def output_paths(items: Sequence[FileJob], folder: Path, extension: str) -> list
     """
     names = [str(item.place.with_name(item.place.stem)) for item in items]
     while True:
-        taken: dict[str, int] = {FAILED.removesuffix(extension): 1} if FAILED.endswith(extension) else {}
-        for name in names:
-            taken[name] = taken.get(name, 0) + 1
+        taken = Counter([*names, *([FAILED.removesuffix(extension)] if FAILED.endswith(extension) else [])])
         changed = False
         for index, item in enumerate(items):
             if taken[names[index]] > 1 and names[index] != str(item.place):
