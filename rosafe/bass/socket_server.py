@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterator
 
 from rosafe.bass.capture import Snapshot
+from rosafe.transport.handshake_server import keep_alive
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8081
 MAX_CLIENTS = 31
@@ -27,12 +28,6 @@ PAUSE_SECONDS = 0.5  # in accepting connections when the process has no file des
 _MAX_REQUEST = 4096  # bytes that are kept if they contain no complete request
 _MARK = b"Read Port"
 _COUNT, _FIRST = re.compile(rb"N[^\w-]*(-?\d{1,40})"), re.compile(rb"nfr[^\w-]*(-?\d{1,40})")
-_KEEP_ALIVE = (  # detects clients that have disappeared, within two minutes
-    (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
-    (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 60),
-    (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10),
-    (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 6),
-)
 _HEADER = struct.Struct("<iiq")
 
 
@@ -154,8 +149,7 @@ class DedicatedSocket:
             return
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        for level, option, value in _KEEP_ALIVE:
-            connection.setsockopt(level, option, value)
+        keep_alive(connection, idle=60, interval=10, count=6)
         client = _Client(connection)
         self._clients[connection.fileno()] = client
         self._selector.register(connection, selectors.EVENT_READ, client)

@@ -90,11 +90,3 @@ class _LineWriter:
 
     def flush(self) -> None:
         self._stream.flush()
-
-
-def bytes_text(count: float) -> str:
-    """Return a size as ``12 bytes`` or ``3.4 MB``."""
-    for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= size:
-            return f"{count / size:.1f} {unit}"
-    return f"{count:.0f} bytes"

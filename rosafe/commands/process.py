@@ -33,8 +33,9 @@ from rosafe.commands._parameters import (
     parameters_of,
     parse_settings,
 )
-from rosafe.commands._progress import ProgressDisplay, bytes_text
+from rosafe.commands._progress import ProgressDisplay
 from rosafe.commands._workers import Interrupted, Interrupts, TaskReport, run_parallel
+from rosafe.declarations.text import bytes_text
 from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE, Parameter
 from rosafe.interface.arguments import check_outputs
 from rosafe.interface.remarks import NO_FRAMES, warnings_of
@@ -159,8 +160,7 @@ def _epilog() -> str:
 
 
 def _coordinates() -> str:
-    units = {parameter.name: parameter.unit for kind in KINDS.values() for parameter in kind.parameters}
-    units |= {derived.name: derived.unit for kind in KINDS.values() for derived in kind.derived}
+    units = {name: unit for kind in KINDS.values() for name, unit in kind.units.items()}
     names = dict.fromkeys(name for kind in KINDS.values() for name in kind.coordinates)
     return ", ".join(f"{name} ({units[name]})" if units[name] else name for name in names)
 

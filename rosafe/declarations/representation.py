@@ -252,6 +252,11 @@ class Representation:
         parameters = [name for p in self.parameters for name in (p.name, *p.aliases, *p.former)]
         return parameters + [derived.name for derived in self.derived]
 
+    @property
+    def units(self) -> dict[str, str]:
+        """The units of all parameters and derived values, by name."""
+        return {p.name: p.unit for p in self.parameters} | {d.name: d.unit for d in self.derived}
+
     def parameter(self, name: str) -> Parameter:
         """Return the parameter with this name in modifyParameter. Raise KeyError if there is none."""
         for parameter in self.parameters:

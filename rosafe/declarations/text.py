@@ -38,3 +38,11 @@ def did_you_mean(word: str, known: Collection[str]) -> str:
     """Return a hint for the end of a message, ``; did you mean ...?``; empty if no `known` word is similar."""
     close = closest_match(word, known, 0.75)
     return f"; did you mean {close}?" if close else ""
+
+
+def bytes_text(count: float) -> str:
+    """Return a size as ``12 bytes`` or ``3.4 MB``."""
+    for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.1f} {unit}"
+    return f"{count:.0f} bytes"

@@ -84,10 +84,9 @@ class TreeSnapshot:
             kind = KINDS.get(ancestor.kind)
             if kind is None:
                 break
-            units = {p.name: p.unit for p in kind.parameters} | {d.name: d.unit for d in kind.derived}
             for name in kind.coordinates:
                 values = _parse_list(kind, name, ancestor.values.get(name, ""))
-                if units[name] == unit and len(values) == size:
+                if kind.units[name] == unit and len(values) == size:
                     return values
         return []
 

@@ -251,10 +251,13 @@ class Chain:
     def _all(self) -> list[Processor]:
         return list(itertools.chain(*self._processors.values()))
 
-    def shapes(self, kind: str, frames: int) -> dict[str, list[tuple[int, ...]]]:
-        """Return the shape of each part of an output in each branch, for `frames` audio frames without a change."""
+    def shapes(self, kind: str, frames: int, pad: bool) -> dict[str, list[tuple[int, ...]]]:
+        """Return the shape of each part of an output in each branch, for `frames` audio frames without a change.
+
+        With `pad`, the frames that begin within the signal are complete.
+        """
         processors = self._processors[kind]
-        count = self._count(processors[0], frames)
+        count = self._frame_count(kind, frames, pad)
         branches = zip(*(processor.output_shapes for processor in processors), strict=True)
         return {
             name: [(*rows, count) for rows in of_part]
@@ -267,18 +270,18 @@ class Chain:
             frames if processor.parent is None else self._count(processor.parent, frames)
         )
 
-    def times(self, kind: str, frames: int) -> np.ndarray:
-        """Return the middle of each frame of an output (s) for a signal of `frames` audio frames."""
+    def _frame_count(self, kind: str, frames: int, pad: bool) -> int:
+        """Return the number of output frames for `frames` audio frames; with `pad`, of those that begin within them."""
         processor = self._processors[kind][0]
-        return frame_times(processor.signal, 0, self._count(processor, frames))
+        return -(-frames // processor.signal.hop) if pad else self._count(processor, frames)
 
-    def complete_count(self, kind: str, frames: int) -> int:
-        """Return the number of output frames that begin within `frames` audio frames."""
-        return -(-frames // self._processors[kind][0].signal.hop)
+    def times(self, kind: str, frames: int, pad: bool) -> np.ndarray:
+        """Return the middle of each frame of an output (s); the arguments are those of `shapes`."""
+        return frame_times(self._processors[kind][0].signal, 0, self._frame_count(kind, frames, pad))
 
     def padding(self, frames: int) -> int:
         """Return the number of audio frames after the signal that complete the last frame of each output."""
-        outputs = [(self._processors[kind][0], self.complete_count(kind, frames)) for kind in self._outputs]
+        outputs = [(self._processors[kind][0], self._frame_count(kind, frames, pad=True)) for kind in self._outputs]
 
         def completes(extra: int) -> bool:
             return all(self._count(processor, frames + extra) >= count for processor, count in outputs)

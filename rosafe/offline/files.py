@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rosafe.declarations.block_length import DEFAULT_FRAMES_PER_BLOCK
+from rosafe.declarations.text import bytes_text
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs, check_parameters
 from rosafe.offline.chain import Chain, FrameLimiter, computed_ears, effective_parameters
@@ -235,18 +236,17 @@ class _FileRun:
             self._progress(min(self._done.values()), self._sound.frames)
 
     def _contents(self, chain: Chain) -> Contents:
-        frames, kinds = self._sound.frames, self._kinds
+        frames, kinds, pad = self._sound.frames, self._kinds, "pad" in self._about
         parts = {name: part for kind in kinds for name, part in KINDS[kind].outputs.items()}
         described = chain.describe()
         names = {name: value for name, value in described.items() if isinstance(value, list)}
         framed = [kind for kind in kinds if f"{kind}_frameRate" in described]
-        times = {f"{kind}_time": self._times(chain, kind) for kind in framed}
+        times = {f"{kind}_time": chain.times(kind, frames, pad) for kind in framed}
         shapes = {}
         for kind in kinds:
-            for name, (shape,) in chain.shapes(kind, frames).items():
+            for name, (shape,) in chain.shapes(kind, frames, pad).items():
                 ears = (self._sound.channels,) if parts[name].axes[0] == "ear" else shape[:1]
-                count = chain.complete_count(kind, frames) if self._padding else shape[-1]
-                shapes[name] = (*ears, *shape[1:-1], count) if len(shape) > 1 else (count,)
+                shapes[name] = (*ears, *shape[1:]) if len(shape) > 1 else shape
         rate = self._sound.sample_rate
         parameters = effective_parameters(self._values, kinds, rate)
         return Contents(
@@ -257,12 +257,6 @@ class _FileRun:
             {"sample_rate": rate, "parameters": parameters, **self._about, **names, "clipped": 0},
         )
 
-    def _times(self, chain: Chain, kind: str) -> np.ndarray:
-        frames = self._sound.frames
-        if not self._padding:
-            return chain.times(kind, frames)
-        return chain.times(kind, frames + self._padding)[: chain.complete_count(kind, frames)]
-
 
 def _check_disk_space(path: Path, size: int) -> None:
     """Raise OutputError if less than `size` bytes are free on the disk, before hours of computation."""
@@ -270,9 +264,5 @@ def _check_disk_space(path: Path, size: int) -> None:
     free = disk.f_bavail * disk.f_frsize
     if size > free:
         raise OutputError(
-            f"the output would take {_bytes_text(size)}, but only {_bytes_text(free)} are free; name fewer --outputs"
+            f"the output would take {bytes_text(size)}, but only {bytes_text(free)} are free; name fewer --outputs"
         )
-
-
-def _bytes_text(count: int) -> str:
-    return f"{count / 1e9:.1f} GB" if count >= 1e8 else f"{count / 1e6:.3f} MB"

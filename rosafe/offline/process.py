@@ -188,17 +188,9 @@ class _ProcessCall:
             silence = min(DEFAULT_FRAMES_PER_BLOCK, self.padding - first)
             yield np.zeros((len(ears), silence), as_samples(ears[:, :0]).dtype)
 
-    def _shapes(self, kind: str, pad: bool) -> dict[str, list[tuple[int, ...]]]:
-        """Return the shape of each part of an output in each branch."""
-        shapes = self.chain.shapes(kind, self.frames)
-        if not pad:
-            return shapes
-        count = self.chain.complete_count(kind, self.frames)
-        return {name: [(*shape[:-1], count) for shape in of_part] for name, of_part in shapes.items()}
-
     def _prepare(self, frames: int, lengths: list[int], changes: list[tuple[int, str, Any]], pad: bool) -> None:
         """Schedule the changes, check the memory and allocate the outputs."""
-        shapes = {kind: self._shapes(kind, pad) for kind in self.outputs}  # before any change
+        shapes = {kind: self.chain.shapes(kind, frames, pad) for kind in self.outputs}  # before any change
         self.padding = self.chain.padding(frames) if pad else 0
         one_round = itertools.islice(_edges(lengths, frames), len(lengths))
         largest_block = max((end - first for first, end in one_round), default=0)
@@ -227,8 +219,8 @@ class _ProcessCall:
 
     def _size(self, pad: bool, largest_block: int) -> int:
         """Return the bytes of all results, or of the largest block if that is more."""
-        shapes = (shape for kind in self.outputs for part in self._shapes(kind, pad).values() for shape in part)
-        results = sum(self.dtype.itemsize * math.prod(shape) for shape in shapes)
+        parts = (part for kind in self.outputs for part in self.chain.shapes(kind, self.frames, pad).values())
+        results = sum(self.dtype.itemsize * math.prod(shape) for part in parts for shape in part)
         return max(results, self.chain.largest_block(largest_block)[1])
 
     def collect(self, kind: str, branch: int, block: Block) -> None:

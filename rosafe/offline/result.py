@@ -78,9 +78,7 @@ class Result(dict[str, Any]):
         units: dict[str, str] = {}
         for kind in KINDS.values():
             units |= {f"{kind.kind}_time": "s", f"{kind.kind}_frameRate": "Hz"}
-            units |= {parameter.name: parameter.unit for parameter in kind.parameters}
-            units |= {derived.name: derived.unit for derived in kind.derived}
-            units |= {name: part.unit for name, part in kind.outputs.items()}
+            units |= kind.units | {name: part.unit for name, part in kind.outputs.items()}
         return {name: units[name] for name in self if name in units}
 
     def plot(self, outputs: Sequence[str] | str | None = None, ax: Axes | None = None, **options: Any) -> Figure:

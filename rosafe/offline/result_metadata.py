@@ -151,14 +151,6 @@ def _is_positive(value: Any) -> bool:
     return is_number(value) and 1 <= value < 2**53
 
 
-def _is_rate(value: Any) -> bool:
-    return is_number(value) and 0 < value < 2**53
-
-
-def _is_count(value: Any) -> bool:
-    return is_number(value) and 0 <= value < 2**53 and value == int(value)
-
-
 def _is_text(value: Any) -> bool:
     return isinstance(value, str)
 
@@ -177,8 +169,8 @@ def _is_dict_of(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
 
 
 _TYPES: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "sample_rate": ("a positive number", _is_rate),
-    "clipped": ("a number of samples", _is_count),
+    "sample_rate": ("a positive number", lambda found: is_number(found) and 0 < found < 2**53),
+    "clipped": ("a number of samples", lambda found: is_number(found) and 0 <= found < 2**53 and found == int(found)),
     "pad": ("true or false", lambda found: isinstance(found, (bool, int, float))),
     "clip": ("true or false", lambda found: isinstance(found, (bool, int, float))),
     "dtype": ("float32 or float64", lambda found: found in ("float32", "float64")),

@@ -48,10 +48,9 @@ def axis_coordinates(result: Mapping[str, Any], kind: Representation, axis: str,
     while kind.parent and any(axis in part.axes for part in KINDS[kind.parent].parts):
         kind = KINDS[kind.parent]  # the representation that introduces the axis
     unit = {"channel": "Hz", "filter": "Hz", "lag": "s", "feature": ""}[axis]
-    units = {one.name: one.unit for one in kind.parameters} | {one.name: one.unit for one in kind.derived}
     for name in kind.coordinates:
         values = result.get(name, ())
-        if units[name] == unit and len(values) == size:
+        if kind.units[name] == unit and len(values) == size:
             return _checked(name, values) if unit else np.asarray(values)
     return np.arange(size)
 

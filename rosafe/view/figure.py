@@ -1,8 +1,4 @@
-"""A figure of a binaural signal: ratemaps, level differences, cross-correlation, and the direction of the source.
-
->>> shown = Representations.from_process(rosafe.process(signal, 44100))     # doctest: +SKIP
->>> save(draw(shown, "two talkers"), Path("two-talkers.png"))               # doctest: +SKIP
-"""
+"""A figure of a binaural signal: ratemaps, level differences, cross-correlation, and the direction of the source."""
 
 from __future__ import annotations
 

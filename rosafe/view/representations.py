@@ -1,10 +1,8 @@
-"""Ratemap, level difference and cross-correlation on one time axis, from `rosafe.process` or from the ports."""
+"""Ratemap, level difference and cross-correlation on one time axis, from the ports of a node."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -37,31 +35,6 @@ class Representations:
     correlation: np.ndarray
 
     @classmethod
-    def from_process(cls, result: Mapping[str, Any], start: float = 0.0) -> Representations:
-        """Return the representations of a result of `rosafe.process` with ``rm_scaling`` power (the default).
-
-        Parameters
-        ----------
-        result : mapping
-            Contains `ild`, `ratemap` and `crossCorrelation` with their frame rates, and `fb_cfHz`.
-        start : float
-            Time of the first sample of the signal (s).
-
-        The times are exact for windows of two hops (the default).
-        """
-
-        def series(kind: str, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return start + (1 + np.arange(data.shape[-1])) / result[f"{kind}_frameRate"], data
-
-        return cls.aligned(
-            result["fb_cfHz"],
-            result["cc_lags"],
-            ratemap=series("ratemap", result["ratemap"]),
-            ild=series("ild", result["ild"]),
-            correlation=series("crossCorrelation", result["crossCorrelation"].mean(axis=0)),
-        )
-
-    @classmethod
     def aligned(
         cls,
         center_frequencies: np.ndarray,
@@ -84,18 +57,6 @@ class Representations:
             times = ild[0][(ild[0] >= first) & (ild[0] <= last)]
         at_times = [data[..., _nearest(own, times)] for own, data in series]
         return cls(times, np.asarray(center_frequencies), np.asarray(lags), *at_times)
-
-    def tail(self, seconds: float) -> Representations:
-        """Return the last `seconds`."""
-        first = int(np.searchsorted(self.times, self.times[-1] - seconds)) if len(self.times) else 0
-        return Representations(
-            self.times[first:],
-            self.center_frequencies,
-            self.lags,
-            self.ratemap[..., first:],
-            self.ild[..., first:],
-            self.correlation[..., first:],
-        )
 
 
 def _nearest(sorted_values: np.ndarray, targets: np.ndarray) -> np.ndarray:

@@ -12,11 +12,12 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+import rosafe
 from rosafe.output import OutputError
 from rosafe.view import figure
 from rosafe.view.axes import save
 from rosafe.view.representations import Representations
-from tests.view.conftest import represented
+from tests.view.conftest import OUTPUTS, aligned, tail
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -93,7 +94,8 @@ def test_sources_behind_the_head_are_drawn(walk: Representations) -> None:
 
 
 def test_a_figure_of_silence(tmp_path: Path) -> None:
-    save(figure.draw(represented(np.zeros((2, 16000)), 16000), "nothing"), tmp_path / "silence.png")
+    silence = aligned(rosafe.process(np.zeros((2, 16000)), 16000, outputs=OUTPUTS))
+    save(figure.draw(silence, "nothing"), tmp_path / "silence.png")
     assert pixels(tmp_path / "silence.png").shape[2] == 3
 
 
@@ -113,13 +115,13 @@ def test_any_number_of_channels(channels: int, tmp_path: Path) -> None:
 
 def test_too_few_frames_are_rejected(walk: Representations) -> None:
     with pytest.raises(ValueError, match="expected at least 2 frames, got 1"):
-        figure.draw(walk.tail(0.0), "")
+        figure.draw(tail(walk, 0.0), "")
 
 
 def test_a_failed_save_keeps_the_old_file(
     walk: Representations, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawing = figure.draw(walk.tail(0.5), "")
+    drawing = figure.draw(tail(walk, 0.5), "")
     path = tmp_path / "old.png"
     path.write_bytes(b"old")
 
@@ -133,14 +135,14 @@ def test_a_failed_save_keeps_the_old_file(
 
 
 def test_a_saved_file_has_default_permissions(walk: Representations, tmp_path: Path) -> None:
-    save(figure.draw(walk.tail(0.5), ""), tmp_path / "a.png")
+    save(figure.draw(tail(walk, 0.5), ""), tmp_path / "a.png")
     (tmp_path / "b").touch()
     assert (tmp_path / "a.png").stat().st_mode == (tmp_path / "b").stat().st_mode
 
 
 def test_matplotlib_settings_of_the_user_have_no_effect(walk: Representations, tmp_path: Path) -> None:
     def png() -> bytes:
-        save(figure.draw(walk.tail(0.5), "x"), tmp_path / "x.png")
+        save(figure.draw(tail(walk, 0.5), "x"), tmp_path / "x.png")
         return (tmp_path / "x.png").read_bytes()
 
     plain = png()

@@ -6,6 +6,7 @@ import numpy as np
 
 import rosafe
 from rosafe.view.representations import Representations
+from tests.view.conftest import aligned
 
 
 def test_series_with_different_hops_are_aligned() -> None:
@@ -13,7 +14,7 @@ def test_series_with_different_hops_are_aligned() -> None:
     result = rosafe.process(
         signal, 16000, parameters={"cc_hSizeSec": 0.015, "cc_wSizeSec": 0.03, "rm_hSizeSec": 0.005, "rm_wSizeSec": 0.01}
     )
-    shown = Representations.from_process(result)
+    shown = aligned(result)
     assert shown.ild.shape[-1] == shown.ratemap.shape[-1] == shown.correlation.shape[-1] == len(shown.times) > 150
     frame = 80
     nearest = np.abs((1 + np.arange(result["ratemap"].shape[-1])) / 200 - shown.times[frame]).argmin()
