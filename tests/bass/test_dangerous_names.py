@@ -36,7 +36,7 @@ print(client.get_result().genom_exdetail)
 
 
 @pytest.fixture(scope="module")
-def doors(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+def nodes_world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     """Start a graph with a bass that has a working directory of its own."""
     with worlds.world(tmp_path_factory.mktemp("world"), nodes=False) as world:
         work = world.graph.home / "work"
@@ -81,11 +81,11 @@ def in_octave(world: World, name: str) -> str:
     return str(octave.run_and_parse(world, script)["told"])
 
 
-@pytest.mark.parametrize("door", [service, action, http, tcl, in_octave], ids=lambda door: door.__name__)
+@pytest.mark.parametrize("call", [service, action, http, tcl, in_octave], ids=lambda call: call.__name__)
 @pytest.mark.parametrize("name", ATTACKS, ids=range(len(ATTACKS)))
-def test_through_the_node(doors: World, door: Callable[[World, str], str], name: str) -> None:
-    assert "::bass::e_device" in door(doors, name)
-    assert os.listdir(doors.graph.home / "work") == []
+def test_through_the_node(nodes_world: World, call: Callable[[World, str], str], name: str) -> None:
+    assert "::bass::e_device" in call(nodes_world, name)
+    assert os.listdir(nodes_world.graph.home / "work") == []
 
 
 @pytest.mark.parametrize("name", ATTACKS, ids=range(len(ATTACKS)))

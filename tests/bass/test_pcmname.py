@@ -207,7 +207,7 @@ def test_unsafe_names_are_rejected(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "asked"),
+    ("name", "opened"),
     [
         ("hw:1,0", None),
         ("hw:CARD=PCH,DEV=0,SUBDEV=1", None),
@@ -231,8 +231,8 @@ def test_unsafe_names_are_rejected(folder: Path, name: str) -> None:
         ("nosuch", None),
     ],
 )
-def test_safe_names_are_accepted(folder: Path, name: str, asked: str | None) -> None:
-    assert checked_name(name) == (asked or name)
+def test_safe_names_are_accepted(folder: Path, name: str, opened: str | None) -> None:
+    assert checked_name(name) == (opened or name)
 
 
 def test_pcms_of_the_configuration_can_be_opened_by_plain_name(folder: Path) -> None:

@@ -98,9 +98,9 @@ def test_samples_do_not_depend_on_the_chunks(cuts: list[int], rate: int) -> None
 
 
 def test_options() -> None:
-    usual = Scene(8000).frames(8000)
-    assert np.array_equal(Scene(8000, seconds=10, level=-30, seed=0).frames(8000), usual)
-    assert not np.array_equal(Scene(8000, seed=1).frames(8000), usual)
+    default = Scene(8000).frames(8000)
+    assert np.array_equal(Scene(8000, seconds=10, level=-30, seed=0).frames(8000), default)
+    assert not np.array_equal(Scene(8000, seed=1).frames(8000), default)
     source = open_source("scene:?seconds=0.5&seed=7", 8000, 800, threading.Event())
     chunk = source.read()
     assert chunk is not None

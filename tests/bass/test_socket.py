@@ -271,22 +271,22 @@ def test_a_client_with_requests_stays_and_one_with_other_text_is_replaced(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(socket_server, "IDLE_SECONDS", 0.5)
-    asking, sending, *others = full(server)
+    active, sending, *others = full(server)
     others += [socket.create_connection(server.address, timeout=PATIENCE) for _ in range(3)]  # three beyond the limit
 
     def all_served() -> bool:
-        asking.sendall(b"Read Port - N 1 - nfr 90\n")
-        assert receive(asking)[3] == [90]
+        active.sendall(b"Read Port - N 1 - nfr 90\n")
+        assert receive(active)[3] == [90]
         if not closed(sending):
             sending.sendall(b"rubbish, Read Port - N")
         others.append(socket.create_connection(server.address, timeout=PATIENCE))
         return closed(sending)
 
     wait_for(all_served, what="the end of the client that sends rubbish")
-    assert not closed(asking)
-    asking.sendall(b"Read Port - N 1 - nfr 91\n")
-    assert receive(asking)[3] == [91]
-    for connection in (asking, sending, *others):
+    assert not closed(active)
+    active.sendall(b"Read Port - N 1 - nfr 91\n")
+    assert receive(active)[3] == [91]
+    for connection in (active, sending, *others):
         connection.close()
 
 

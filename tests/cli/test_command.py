@@ -58,8 +58,8 @@ def test_help_of_every_command_has_an_example(name: str) -> None:
 
 
 def test_help_of_request_names_every_representation() -> None:
-    told = re.split(r"[\s,]+", rosafe("request", "-h").stdout)
-    assert {kind.word for kind in KINDS.values()} - set(told) == set()
+    listed = re.split(r"[\s,]+", rosafe("request", "-h").stdout)
+    assert {kind.word for kind in KINDS.values()} - set(listed) == set()
 
 
 def test_help_into_a_closed_pipe() -> None:

@@ -125,8 +125,8 @@ def test_links(tmp_path: Path) -> None:
     (here / "nowhere.wav").symlink_to("nothing.wav")
     done = rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path)
     assert done.returncode == 1
-    wanted = {f"linked/{name}": sound for name, sound in sounds.items()} | {"one": sounds["s0"]}
-    assert_results(tmp_path / "out", wanted)
+    required = {f"linked/{name}": sound for name, sound in sounds.items()} | {"one": sounds["s0"]}
+    assert_results(tmp_path / "out", required)
     assert failed(tmp_path / "out") == {"corpus/nowhere.wav": "corpus/nowhere.wav: No such file or directory"}
 
 
@@ -297,9 +297,9 @@ def test_killed_and_resumed(tmp_path: Path) -> None:
     """All results are complete whenever the command is killed, and in the end none is missing."""
     sounds = corpus(tmp_path / "corpus", 60)
     out = tmp_path / "out"
-    for wanted in (5, 20, 35):
+    for required in (5, 20, 35):
         with start("process", "corpus", "-o", "out", *OPTIONS, "--resume", cwd=tmp_path) as command:
-            wait_for(lambda: len(list(out.rglob("*.npz"))) >= wanted, what=lambda: str(command))  # noqa: B023
+            wait_for(lambda: len(list(out.rglob("*.npz"))) >= required, what=lambda: str(command))  # noqa: B023
             os.killpg(command.pid, signal.SIGKILL)
             command.wait()
         for path in out.rglob("*.npz"):

@@ -19,9 +19,9 @@ EVERYTHING += ["alsaaudio", "sound devices", "HTTP server", "Tcl", "plots", "ext
 
 def findings(done: subprocess.CompletedProcess[str]) -> dict[str, dict[str, str]]:
     """Return the checks by name, and assert that the exit code fits them."""
-    told: dict[str, Any] = json.loads(done.stdout)
-    assert told["ok"] == (done.returncode == 0) == all(check["state"] != "MISSING" for check in told["checks"])
-    return {check["name"]: check for check in told["checks"]}
+    report: dict[str, Any] = json.loads(done.stdout)
+    assert report["ok"] == (done.returncode == 0) == all(check["state"] != "MISSING" for check in report["checks"])
+    return {check["name"]: check for check in report["checks"]}
 
 
 def python(program: str, *options: str, **env: str) -> subprocess.CompletedProcess[str]:

@@ -80,11 +80,11 @@ def test_parameters_in_effect_are_stored(tmp_path: Path, sound: Path) -> None:
     target = tmp_path / "result.npz"
     few: dict[str, Any] = {"fb_nChannels": 3}
     process_file(sound, target, few, outputs=["ild"])
-    told = rosafe.load(target)["parameters"]
-    assert told["fb_highFreqHz"] == rosafe.load(target)["fb_cfHz"][-1] == 7600.0
+    effective = rosafe.load(target)["parameters"]
+    assert effective["fb_highFreqHz"] == rosafe.load(target)["fb_cfHz"][-1] == 7600.0
     every = {p.name for kind in KINDS.values() for p in kind.parameters}
-    assert every - set(told) == {"ams_highFreqHz"}  # follows the sample rate, and is not computed
-    again = rosafe.process(as_int32(noise(9000)), RATE, parameters=told, outputs=["ild"])
+    assert every - set(effective) == {"ams_highFreqHz"}  # follows the sample rate, and is not computed
+    again = rosafe.process(as_int32(noise(9000)), RATE, parameters=effective, outputs=["ild"])
     np.testing.assert_array_equal(again["ild"], rosafe.load(target)["ild"])
     for same in (few, {**few, "fb_highFreqHz": 7600.0}):
         assert process_file(sound, target, same, outputs=["ild"], resume=True).skipped
@@ -318,10 +318,12 @@ def test_bags(tmp_path: Path) -> None:
     messages = [bags.message(samples, index, 120, RATE) for index in indexes]
     bags.write(tmp_path / "a.bag", messages)
     bags.write(tmp_path / "left.bag", messages, "/left/Audio")
-    heard = samples.copy()
-    heard[:, 5920:6380] = 0
+    expected_samples = samples.copy()
+    expected_samples[:, 5920:6380] = 0
     parameters: dict[str, Any] = SMALL_PARAMETERS
-    expected = rosafe.process(heard, RATE, parameters=parameters, block_frames=1000, outputs=["input", "ild"])
+    expected = rosafe.process(
+        expected_samples, RATE, parameters=parameters, block_frames=1000, outputs=["input", "ild"]
+    )
     options = (*SMALL, "--outputs", "input,ild", "--block", "1000")
     assert command("process", "a.bag", "left.bag", *options, cwd=tmp_path).returncode == 0
     for name in ("a", "left"):

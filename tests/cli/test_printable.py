@@ -47,10 +47,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def assert_harmless(done: subprocess.CompletedProcess[str], code: int) -> None:
     """Assert the exit code, and that the name was printed in escaped form."""
-    told = done.stdout + done.stderr
-    assert done.returncode == code and "Traceback" not in told, done
-    assert r"e\x1b[31m\x07\n\r\x9b1m\u202e" in told, told
-    assert all(line.isprintable() for line in told.split("\n")), told
+    output = done.stdout + done.stderr
+    assert done.returncode == code and "Traceback" not in output, done
+    assert r"e\x1b[31m\x07\n\r\x9b1m\u202e" in output, output
+    assert all(line.isprintable() for line in output.split("\n")), output
 
 
 @pytest.mark.parametrize(
@@ -144,9 +144,9 @@ def test_logs_of_a_node(graph: Graph) -> None:
 
 def test_errors_of_a_saved_tree(tmp_path: Path) -> None:
     reports: list[str] = []
-    keeper = TreeStateFile(
+    state_file = TreeStateFile(
         tmp_path / EVIL / "tree.yaml", lambda: Setup(AcquireSettings({"device": "scene:"})), reports.append
     )
-    keeper.save()
-    assert SHOWN in keeper.problem and keeper.problem.isprintable()
-    assert reports == [f"the tree is not kept: {keeper.problem}"]
+    state_file.save()
+    assert SHOWN in state_file.problem and state_file.problem.isprintable()
+    assert reports == [f"the tree is not kept: {state_file.problem}"]

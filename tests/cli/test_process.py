@@ -122,12 +122,12 @@ def test_settings_and_blocks(tmp_path: Path) -> None:
     assert not np.array_equal(expected["preProc"], other["preProc"])
     assert_equal(tmp_path / "in.npz", expected)
     with np.load(tmp_path / "in.npz") as loaded:
-        told = json.loads(str(loaded["parameters"]))
+        effective = json.loads(str(loaded["parameters"]))
         assert loaded["block_frames"] == 1777
     every = {p.name for kind in KINDS.values() for p in kind.parameters}
-    assert set(told) == every - {"ams_highFreqHz"}  # follows the sample rate, and is not computed
-    assert parameters.items() <= told.items()
-    again = process(samples, 16000, parameters=told, block_frames=1777)
+    assert set(effective) == every - {"ams_highFreqHz"}  # follows the sample rate, and is not computed
+    assert parameters.items() <= effective.items()
+    again = process(samples, 16000, parameters=effective, block_frames=1777)
     for name, value in expected.items():
         np.testing.assert_array_equal(again[name], value)
 

@@ -90,16 +90,16 @@ def test_a_zarr_that_is_replaced_is_not_a_part_file(tmp_path: Path, monkeypatch:
     paths, expected = sounds(tmp_path, 2)
     target = tmp_path / "a.zarr"
     assert process(paths[1], target) == "done"
-    told = []
+    messages = []
     exchange = output._renameat2
 
     def renamed(*arguments: Any) -> None:
         exchange(*arguments)
-        told.append(Other(paths[1], target, True).result())
+        messages.append(Other(paths[1], target, True).result())
 
     monkeypatch.setattr(output, "_renameat2", renamed)
     assert process(paths[0], target, True) == "done"
-    assert len(told) == 1 and told[0].endswith("is writing it"), told
+    assert len(messages) == 1 and messages[0].endswith("is writing it"), messages
     np.testing.assert_array_equal(rosafe.load(target)["ild"], expected[0])
     assert not (tmp_path / "a.zarr.part").exists()
 

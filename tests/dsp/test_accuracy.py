@@ -10,7 +10,7 @@ import pytest
 from benchmarks import accuracy
 from tests.harness import ROOT
 
-TOLD = (ROOT / "docs" / "accuracy.md").read_text()
+DOCUMENTED = (ROOT / "docs" / "accuracy.md").read_text()
 
 
 @pytest.mark.parametrize("measure", accuracy.MEASUREMENTS)
@@ -25,7 +25,7 @@ def test_errors_are_within_their_limits(measure: Callable[[], Iterator[accuracy.
 
 
 def lines() -> list[str]:
-    return TOLD.splitlines()
+    return DOCUMENTED.splitlines()
 
 
 def test_the_reference_detects_errors(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,8 +107,8 @@ def test_an_idle_client_continues_afterwards(world: World) -> None:
             go.touch()
             assert client.wait(30) == 0
         assert client.out.split() == ["ready", "done"]
-    told = world.server.err.count("connection limit reached, now by loopback")
-    assert 1 <= told < 10  # once a minute
+    reported = world.server.err.count("connection limit reached, now by loopback")
+    assert 1 <= reported < 10  # once a minute
 
 
 def test_unread_answers_stop_the_requests(world: World) -> None:
@@ -410,7 +410,7 @@ def test_waiting_clients_that_vanish_are_forgotten(world: World) -> None:
 def test_unpaired_surrogates_are_rejected_everywhere(world: World) -> None:
     assert set(attacks.surrogates(world.port)) == {400}
     assert "Traceback" not in world.server.err
-    told = "GENOM ::genom::serialization {what {URL: expected UTF-8}}"
+    reported = "GENOM ::genom::serialization {what {URL: expected UTF-8}}"
     script = r"""
         set g [genomix::connect $address]
         $g load rosAFE
@@ -418,7 +418,7 @@ def test_unpaired_surrogates_are_rejected_everywhere(world: World) -> None:
         show [lindex [failure {rosAFE::ildPort \udfff}] 1]
         show [lindex [failure {$g load bass -i \ud800}] 1]
     """
-    assert world.lines(script) == [told] * 3
+    assert world.lines(script) == [reported] * 3
     command = ("sh", "-c", r"""rosafe request ild --connect "$(printf '\355\240\200')" """)
     done = world.graph.run(*command, check=False)
     assert done.returncode == 1 and "Traceback" not in done.stderr and done.stderr.count("\n") == 1

@@ -27,9 +27,9 @@ def home_graph(tmp_path_factory: pytest.TempPathFactory) -> harness.Graph:
 
 
 def test_help_and_version(home_graph: harness.Graph) -> None:
-    told = home_graph.run(GENOMIXD, "-h").stdout
+    output = home_graph.run(GENOMIXD, "-h").stdout
     for word in ("-p PORT", "--host", "-b", "example:", "curl"):
-        assert word in told
+        assert word in output
     assert home_graph.run(GENOMIXD, "--version").stdout == f"genomixd {__version__}\n"
 
 

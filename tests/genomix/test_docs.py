@@ -23,16 +23,16 @@ def test_the_session_of_the_page(world: World) -> None:
     assert len(steps) == session.count("$ curl") > 15
     for command, shown in steps:
         command = command.replace(":8080/", f":{world.port}/").replace("curl ", "curl -sS --noproxy '*' ", 1)
-        told = world.graph.run("sh", "-c", command).stdout
+        output = world.graph.run("sh", "-c", command).stdout
         pattern = ".*".join(map(re.escape, shown.strip().split("...")))
-        assert re.fullmatch(pattern, told.strip(), re.DOTALL), f"{command}\n{told[:1000]}"
+        assert re.fullmatch(pattern, output.strip(), re.DOTALL), f"{command}\n{output[:1000]}"
 
 
 def test_the_page_names_every_url(world: World) -> None:
     page = (harness.ROOT / "docs" / "genomixd.md").read_text("utf-8")
-    status, told = world.http.raw("/")
+    status, output = world.http.raw("/")
     assert status == 200
-    for path in set(re.findall(r"/(?:session|request)/[a-z]+|/[a-z]+(?=/[A-Z]|\?|\n)", told)):
+    for path in set(re.findall(r"/(?:session|request)/[a-z]+|/[a-z]+(?=/[A-Z]|\?|\n)", output)):
         assert path in page
 
 

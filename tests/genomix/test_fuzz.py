@@ -86,9 +86,9 @@ def test_random_text_is_rejected(world: World) -> None:
         body = response.read()
         assert response.status in (200, 400, 404, 409, 422, 502, 503), (path, query, response.status, body[:300])
         if response.status != 200 and b"syntax=tcl" not in text.encode():
-            told = json.loads(body)
-            assert told["ex"].startswith("::")
-            assert told["ex"] != "::genom::unkex", (path, query, told)
+            error = json.loads(body)
+            assert error["ex"].startswith("::")
+            assert error["ex"] != "::genom::unkex", (path, query, error)
 
     memory = resident(world.server.pid)
     throw()

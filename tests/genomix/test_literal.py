@@ -30,7 +30,7 @@ def start(world: World, *processors: str) -> None:
         world.http.call(f"rosAFE/{request}")
 
 
-def told(world: World, kind: str, name: str) -> dict[str, Any]:
+def reported_parameters(world: World, kind: str, name: str) -> dict[str, Any]:
     parameters = world.http.call("rosAFE/getParameters")["parameters"][kind]
     return next(one for one in parameters if one["name"] == name)
 
@@ -48,7 +48,10 @@ def test_a_zero_is_literal_with_call_and_send(world: World) -> None:
     world.http.wait(world.http.send("rosAFE/PreProc", {"name": "sent", "pp_coefPreEmphasis": 0}), "sent")
     for name, level in (("called", 0.0), ("sent", 100.0)):
         wait_for(functools.partial(is_there, world, name))
-        assert (told(world, "preProc", name)["pp_coefPreEmphasis"], told(world, "preProc", name)["pp_refSPLdB"]) == (
+        assert (
+            reported_parameters(world, "preProc", name)["pp_coefPreEmphasis"],
+            reported_parameters(world, "preProc", name)["pp_refSPLdB"],
+        ) == (
             0.0,
             level,
         )
@@ -91,17 +94,17 @@ def test_zeros_of_plain_ros_clients_stand_for_defaults(world: World) -> None:
     start(world)
     done = world.graph.run("rosservice", "call", "/rosAFE/PreProc", "{name: plain, pp_coefPreEmphasis: 0}")
     assert "genom_success: True" in done.stdout and "genom_exdetail: ''" in done.stdout
-    assert told(world, "preProc", "plain")["pp_coefPreEmphasis"] == 0.97
+    assert reported_parameters(world, "preProc", "plain")["pp_coefPreEmphasis"] == 0.97
 
 
 def test_the_values_of_get_parameters_create_an_equal_processor(world: World) -> None:
     """With a list of centre frequencies, it reports a spacing of 0."""
     start(world, "PreProc")
     world.http.call("rosAFE/GammatoneProc", {"name": "first", "fb_cfHz": [500, 900]})
-    first = told(world, "gammatone", "first")
+    first = reported_parameters(world, "gammatone", "first")
     assert first["fb_nERBs"] == 0
     world.http.call("rosAFE/GammatoneProc", {**first, "name": "second"})
-    assert told(world, "gammatone", "second") == {**first, "name": "second"}
+    assert reported_parameters(world, "gammatone", "second") == {**first, "name": "second"}
 
 
 def test_zeros_of_tcl(world: World) -> None:
@@ -147,7 +150,7 @@ def diagnosed(world: World, text: str, there: bool = True) -> list[Any]:
 def test_a_misspelt_choice_causes_a_warning(world: World) -> None:
     start(world, "PreProc", "GammatoneProc")
     assert world.http.call("rosAFE/IhcProc", {"ihc_method": "bernstien"}) == {"warning": MISSPELT}
-    assert told(world, "ihc", "ihc")["ihc_method"] == "dau"
+    assert reported_parameters(world, "ihc", "ihc")["ihc_method"] == "dau"
     assert world.afe is not None and world.afe.err.count("[WARN]") and MISSPELT in world.afe.err
     number = world.http.send("rosAFE/IhcProc", {"name": "two", "ihc_method": "Bernstein"})
     wanted = MISSPELT.replace("ihc:", "two:", 1).replace("bernstien", "Bernstein")
@@ -155,10 +158,10 @@ def test_a_misspelt_choice_causes_a_warning(world: World) -> None:
     assert world.http.status(number) == {"id": number, "status": "sent", "warning": wanted}
     assert diagnosed(world, "more unknown") == [1, f"{MISSPELT} (and 1 more unknown words)", [MISSPELT, wanted]]
     change = {"nameProc": "two", "nameParam": "ihc_method", "newValue": "halfwav"}
-    change_told = "two: ihc_method: unknown word 'halfwav'; dau is used; the most similar known word is halfwave"
-    assert world.http.call("rosAFE/modifyParameter", change) == {"warning": change_told}
+    changed_parameters = "two: ihc_method: unknown word 'halfwav'; dau is used; the most similar known word is halfwave"
+    assert world.http.call("rosAFE/modifyParameter", change) == {"warning": changed_parameters}
     number = world.http.send("rosAFE/modifyParameter", change)
-    assert world.http.wait(number, "done")["warning"] == change_told
+    assert world.http.wait(number, "done")["warning"] == changed_parameters
     # corrected values and removed processors cause no further warnings
     world.http.call("rosAFE/modifyParameter", {**change, "newValue": "halfwave"})
     assert diagnosed(world, "more unknown", there=False) == [1, MISSPELT, [MISSPELT]]

@@ -127,8 +127,8 @@ def test_clients_get_the_error_immediately(graph: Graph, nameless: int, tmp_path
     name = socket.gethostname()
     script = tmp_path / "script.tcl"
     script.write_text(f"package require genomix\nputs [catch {{genomix::connect {name}:{nameless}}} told]$told")
-    told = graph.run("tclsh", str(script)).stdout
-    assert told.startswith("1") and "--name" in told and name in told
+    output = graph.run("tclsh", str(script)).stdout
+    assert output.startswith("1") and "--name" in output and name in output
     shown = octave.values(
         graph.run(
             *octave.command(tmp_path, f"show('told', message(@() genomix.client('{name}:{nameless}')));"),

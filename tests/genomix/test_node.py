@@ -74,9 +74,9 @@ def test_names(graph: Graph) -> None:
             assert third.stop() == 0
         first.stop(signal.SIGKILL)
         assert names() == {"/genomixd"}
-        with graph.start("genomixd", "-p", str(free_port())) as heir:
-            wait_for(lambda: f"Pid: {heir.pid}\n" in graph.run("rosnode", "info", "/genomixd", check=False).stdout)
-            assert heir.stop() == 0
+        with graph.start("genomixd", "-p", str(free_port())) as successor:
+            wait_for(lambda: f"Pid: {successor.pid}\n" in graph.run("rosnode", "info", "/genomixd", check=False).stdout)
+            assert successor.stop() == 0
     assert not names()
 
 

@@ -237,9 +237,9 @@ def test_the_server_answers_packed(world: World) -> None:
     sent = get("/send/rosAFE/getParameters?syntax=packed&s=p&ack=1")
     assert get(f"/request/wait?syntax=packed&s=p&id={sent['id']}")["output"]["parameters"]["ild"] == []
     world.http.call("bass/Stop")
-    audio, told = get("/call/bass/Audio?syntax=packed")["Audio"], world.http.call("bass/Audio")["Audio"]
-    assert audio["left"].tolist() == told["left"] and len(told["left"]) == 44100
-    assert audio["stamp"] == told["stamp"]
+    audio, as_json = get("/call/bass/Audio?syntax=packed")["Audio"], world.http.call("bass/Audio")["Audio"]
+    assert audio["left"].tolist() == as_json["left"] and len(as_json["left"]) == 44100
+    assert audio["stamp"] == as_json["stamp"]
 
 
 def test_numbers_beyond_the_range_of_floats() -> None:

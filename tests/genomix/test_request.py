@@ -63,9 +63,9 @@ def command(world: World, *arguments: str) -> tuple[int, str, str]:
 
 def test_the_tree_and_its_numbers(sound: World) -> None:
     """The port has the output of `rosafe.process` for the same input and parameters."""
-    wanted = {"fb_nChannels": 5, "ild_wSizeSec": 0.04, "ild_hSizeSec": 0.02, "ihc_method": "halfwave"}
-    told = sound.http.call("rosAFE/request", {"representation": "ild", **wanted, "nFramesPerBlock": 8820})
-    assert told == {
+    requested = {"fb_nChannels": 5, "ild_wSizeSec": 0.04, "ild_hSizeSec": 0.02, "ihc_method": "halfwave"}
+    response = sound.http.call("rosAFE/request", {"representation": "ild", **requested, "nFramesPerBlock": 8820})
+    assert response == {
         "name": "ild_0",
         "dependencies": CHAIN,
         "created": CHAIN,
@@ -74,7 +74,7 @@ def test_the_tree_and_its_numbers(sound: World) -> None:
         "port": "ildPort",
         "topic": "/rosAFE/ildPort/ild_0",
     }
-    assert told["topic"] in sound.graph.topics()
+    assert response["topic"] in sound.graph.topics()
     assert sound.http.call("rosAFE/getDependencies", ["ild_0"])["dependencies"] == CHAIN
     (gammatone,) = parameters(sound, "gammatone")
     assert (gammatone["fb_nChannels"], gammatone["fb_lowFreqHz"]) == (5, 80.0)
@@ -87,7 +87,7 @@ def test_the_tree_and_its_numbers(sound: World) -> None:
     sound.http.call("bass/Stop")
     ild = harness.wait_for(lambda: _settled(sound, "inputProcPort", "ildPort/ild_0"))
     ears = np.array([heard()[ear]["data"] for ear in ("left", "right")])
-    expected = rosafe.process(ears, 44100, parameters=wanted, outputs=["ild"])["ild"][:, -25:]
+    expected = rosafe.process(ears, 44100, parameters=requested, outputs=["ild"])["ild"][:, -25:]
     found = np.array([channel["data"] for channel in ild["left"]["dataN"]])[:, -25:]
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
     assert np.ptp(found) > 1
@@ -104,12 +104,12 @@ def test_matching_processors_are_reused(sound: World) -> None:
     call = sound.http.call
     assert call("rosAFE/request", ["ild", {"fb_nChannels": 3}])["created"] == CHAIN
     assert call("rosAFE/request", ["ild", {"fb_nChannels": "3"}])["reused"] == CHAIN
-    told = call("rosAFE/request", ["ratemap", {"fb_nChannels": 3, "ild_hSizeSec": 0.02, "nFramesPerBlock": 100}])
-    assert (told["created"], told["reused"]) == (["ratemap_0"], CHAIN[:-1])
-    assert told["unused"] == ["ild_hSizeSec", "nFramesPerBlock"]
-    told = call("rosAFE/request", ["crossCorrelation", {"fb_cfHz": [200, 400]}])
-    assert told["created"] == ["filterbank_1", "innerhaircell_1", "crosscorrelation_0"]
-    assert told["topic"] == "/rosAFE/crossCorrelationPort/crosscorrelation_0"
+    response = call("rosAFE/request", ["ratemap", {"fb_nChannels": 3, "ild_hSizeSec": 0.02, "nFramesPerBlock": 100}])
+    assert (response["created"], response["reused"]) == (["ratemap_0"], CHAIN[:-1])
+    assert response["unused"] == ["ild_hSizeSec", "nFramesPerBlock"]
+    response = call("rosAFE/request", ["crossCorrelation", {"fb_cfHz": [200, 400]}])
+    assert response["created"] == ["filterbank_1", "innerhaircell_1", "crosscorrelation_0"]
+    assert response["topic"] == "/rosAFE/crossCorrelationPort/crosscorrelation_0"
     (_, second) = parameters(sound, "gammatone")
     assert call("rosAFE/request", {"representation": "ihc", "gammatone": second})["name"] == "innerhaircell_1"
     assert call("rosAFE/request", ["input"])["port"] == "inputProcPort"
@@ -120,16 +120,16 @@ def test_matching_processors_are_reused(sound: World) -> None:
     assert call("rosAFE/request", ["ild", {"fb_nChannels": 3, "pp_bRemoveDC": 1}])["reused"] == CHAIN
     # The middle of the tree was removed.
     call("rosAFE/removeProcessor", ["filterbank_0"])
-    told = call("rosAFE/request", ["ild", {"fb_nChannels": 3, "pp_bRemoveDC": True}])
-    assert told["dependencies"] == ["input_0", "time_0", "filterbank_2", "innerhaircell_2", "ild_0"]
+    response = call("rosAFE/request", ["ild", {"fb_nChannels": 3, "pp_bRemoveDC": True}])
+    assert response["dependencies"] == ["input_0", "time_0", "filterbank_2", "innerhaircell_2", "ild_0"]
     # Manually created processors are used too.
     call("rosAFE/Stop")
     call("rosAFE/InputProc")
     call("rosAFE/PreProc", {"pp_coefPreEmphasis": 0.9})
-    told = call("rosAFE/request", ["filterbank", {"pp_coefPreEmphasis": 0.9}])
-    assert told["dependencies"] == ["input", "preProc", "filterbank_0"]
-    told = call("rosAFE/request", ["time", {"pp_coefPreEmphasis": 0}])
-    assert told["created"] == ["time_0"]
+    response = call("rosAFE/request", ["filterbank", {"pp_coefPreEmphasis": 0.9}])
+    assert response["dependencies"] == ["input", "preProc", "filterbank_0"]
+    response = call("rosAFE/request", ["time", {"pp_coefPreEmphasis": 0}])
+    assert response["created"] == ["time_0"]
     assert parameters(sound, "preProc")[1]["pp_coefPreEmphasis"] == 0
     assert call("rosAFE/request", ["time", {"pp_coefPreEmphasis": 0}])["reused"] == ["input", "time_0"]
 
@@ -194,8 +194,8 @@ def test_four_concurrent_clients(sound: World) -> None:
 def test_another_instance_and_its_end(world: World) -> None:
     world.http.call("bass/Acquire", {"device": "scene:"})
     with world.graph.node("rosAFE-ros", "-i", "left") as node:
-        told = world.http.call("left/request", ["filterbank", {"fb_nChannels": 2}])
-        assert told["topic"] == "/left/gammatonePort/filterbank_0"
+        response = world.http.call("left/request", ["filterbank", {"fb_nChannels": 2}])
+        assert response["topic"] == "/left/gammatonePort/filterbank_0"
         assert world.http.call("left/gammatonePort/filterbank_0")["gammatonePort"]["numberOfChannels"] == 2
         assert names(world) == [] and len(names(world, "left")) == 3
         code, out, err = command(world, "filterbank", "-i", "left", "fb_nChannels=2")
@@ -279,7 +279,7 @@ def test_the_command(sound: World) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "told"),
+    ("arguments", "code", "message"),
     [
         ([], 2, "the following arguments are required: REPRESENTATION;"),
         (["spikes"], 1, "representation: expected one of input, time"),
@@ -298,10 +298,10 @@ def test_the_command(sound: World) -> None:
         (["ild", "--connect", "no/Topic"], 1, "::genom::no_such_outport"),
     ],
 )
-def test_mistakes_on_the_command_line(world: World, arguments: list[str], code: int, told: str) -> None:
+def test_mistakes_on_the_command_line(world: World, arguments: list[str], code: int, message: str) -> None:
     got, out, err = command(world, *arguments)
     assert (got, out) == (code, "")
-    assert told in err and err.count("\n") == 1 and err.startswith("rosafe request: ")
+    assert message in err and err.count("\n") == 1 and err.startswith("rosafe request: ")
     assert names(world) == []
 
 
@@ -319,8 +319,8 @@ def test_without_sound(world: World) -> None:
         arguments = ("ild", "-i", "deaf", "--connect", "mute/Audio")
         code, out, err = command(world, *arguments)
         assert (code, out) == (1, "")
-        told = "rosafe request: ::rosAFE::e_noData: no audio on the Audio port; start the sound first: "
-        assert err.startswith(told) and err.count("\n") == 1
+        message = "rosafe request: ::rosAFE::e_noData: no audio on the Audio port; start the sound first: "
+        assert err.startswith(message) and err.count("\n") == 1
         assert names(world, "deaf") == []
         with world.graph.start("rosafe", "request", *arguments) as going:
 
@@ -330,7 +330,7 @@ def test_without_sound(world: World) -> None:
 
             harness.wait_for(waiting)
             os.kill(going.pid, signal.SIGINT)
-            assert "genom_success: True" in world.graph.run("sh", "-c", err.removeprefix(told)).stdout
+            assert "genom_success: True" in world.graph.run("sh", "-c", err.removeprefix(message)).stdout
             assert going.wait() == 130, going
             assert (going.out, going.err) == ("", "")
         assert names(world, "deaf") == []

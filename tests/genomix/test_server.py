@@ -27,19 +27,19 @@ def start_tree(http: Http) -> None:
 
 
 def test_load_returns_the_interface(world: World) -> None:
-    told = world.http.get("/load/rosAFE", s="load")
-    assert (told["name"], told["component"], told["instance"]) == ("rosAFE", "rosAFE", "rosAFE")
-    assert list(told["services"]) == [
+    reported = world.http.get("/load/rosAFE", s="load")
+    assert (reported["name"], reported["component"], reported["instance"]) == ("rosAFE", "rosAFE", "rosAFE")
+    assert list(reported["services"]) == [
         s.name for s in (*interface.ROSAFE.services, *interface.ROSAFE.client_side_services)
     ]
-    assert told["services"]["getSignals"]["aliases"] == ["getSignal"]
-    parameter = told["services"]["PreProc"]["parameters"]["pp_refSPLdB"]
+    assert reported["services"]["getSignals"]["aliases"] == ["getSignal"]
+    parameter = reported["services"]["PreProc"]["parameters"]["pp_refSPLdB"]
     assert parameter["default"] == 100.0
     assert parameter["type"] == "double"
     assert parameter["range"] == "from -200 to 400"
     assert parameter["aliases"] == ["pp_refSPLdBS"]
-    assert told["ports"]["ratemapPort"]["aliases"] == ["ratemapProcPort"]
-    assert told["exceptions"]["::rosAFE::e_noData"]
+    assert reported["ports"]["ratemapPort"]["aliases"] == ["ratemapProcPort"]
+    assert reported["exceptions"]["::rosAFE::e_noData"]
     assert world.http.get("/components", s="load") == {"rosAFE": {"component": "rosAFE", "instance": "rosAFE"}}
 
 
@@ -57,8 +57,8 @@ def test_load_by_path_and_alias_and_unload(world: World) -> None:
 
 def test_an_instance_has_names_of_its_own(world: World) -> None:
     with world.graph.node("bass-ros", "-i", "left"):
-        told = world.http.get("/load/bass", i="left")
-        assert (told["name"], told["component"]) == ("left", "bass")
+        reported = world.http.get("/load/bass", i="left")
+        assert (reported["name"], reported["component"]) == ("left", "bass")
         world.http.call("left/Acquire", {"device": "scene:", "nFramesPerChunk": 500})
         assert world.http.call("left/Audio")["Audio"]["nFramesPerChunk"] == 500
         # An instance reports its component.
@@ -150,9 +150,9 @@ def test_exceptions_of_the_component(world: World) -> None:
 
 
 def test_rejected_arguments_are_not_sent_to_a_component(world: World) -> None:
-    for given, told in (({"bogus": 1}, "unknown parameter 'bogus'"), ({"name": 7}, "name is a string")):
+    for given, reported in (({"bogus": 1}, "unknown parameter 'bogus'"), ({"name": 7}, "name is a string")):
         for verb in ("call", "send"):
-            with pytest.raises(HttpError, match=told) as caught:
+            with pytest.raises(HttpError, match=reported) as caught:
                 world.http.get(f"/{verb}/rosAFE/PreProc", given)
             assert (caught.value.status, caught.value.ex) == (400, "::genom::serialization")
     with pytest.raises(HttpError, match="local is missing; connect_port takes local"):
@@ -321,8 +321,8 @@ def test_listeners_may_have_tcl(world: World) -> None:
     with world.http.listening(s="tcl", syntax="tcl") as events:
         number = world.http.send("rosAFE/removeProcessor", ["x"], s="tcl")
         why = "there is no processor 'x'; there are: none"
-        told = f"id {number} status error exception {{ex ::rosAFE::e_noSuchProcessor what {{{why}}}}}"
-        assert next(events) == ("request", told)
+        reported = f"id {number} status error exception {{ex ::rosAFE::e_noSuchProcessor what {{{why}}}}}"
+        assert next(events) == ("request", reported)
 
 
 # --- ports ------------------------------------------------------------------------------------------------------

@@ -188,8 +188,8 @@ def test_events_keep_no_results(monkeypatch: pytest.MonkeyPatch) -> None:
             session.clean(request.id)
         gc.collect()
         assert [value.size for value in component.answers] == [72]
-        told = ["".join(deaf.get_nowait()[1].pieces(JSON)).partition('"status":')[2] for _ in range(3)]
-        assert told == ['"done","output":{"data":[0.0]}}', '"done","large":5064}', '"done","large":100064}']
+        statuses = ["".join(deaf.get_nowait()[1].pieces(JSON)).partition('"status":')[2] for _ in range(3)]
+        assert statuses == ['"done","output":{"data":[0.0]}}', '"done","large":5064}', '"done","large":100064}']
 
     run(check)
 

@@ -64,8 +64,8 @@ def stranger(answer: bytes, endless: bytes = b"") -> Iterator[Stranger]:
         server.close()
 
 
-def length(told: object, body: bytes = b"abc") -> bytes:
-    return OK + f"Content-Length: {told}\r\n\r\n".encode() + body
+def length(reported: object, body: bytes = b"abc") -> bytes:
+    return OK + f"Content-Length: {reported}\r\n\r\n".encode() + body
 
 
 LIES = {
@@ -107,7 +107,7 @@ def test_tcl(lie: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("body", "told"),
+    ("body", "reported"),
     [
         (b"unbalanced {", "expected the description of a component"),
         (b"name", "expected the description of a component"),
@@ -117,7 +117,7 @@ def test_tcl(lie: str, tmp_path: Path) -> None:
         (b"name ::oo services {} ports {}", "is not allowed as a namespace"),
     ],
 )
-def test_tcl_reports_invalid_answers(body: bytes, told: str, tmp_path: Path) -> None:
+def test_tcl_reports_invalid_answers(body: bytes, reported: str, tmp_path: Path) -> None:
     with stranger(length(len(body), body)) as server:
         script = tmp_path / "script.tcl"
         script.write_text(f"""
@@ -127,7 +127,7 @@ def test_tcl_reports_invalid_answers(body: bytes, told: str, tmp_path: Path) -> 
             puts [lindex [dict get $options -errorcode] 0]$message
         """)
         shown = harness.Graph("http://127.0.0.1:9", tmp_path).run("tclsh", str(script)).stdout
-        assert shown.startswith("GENOM") and told in shown
+        assert shown.startswith("GENOM") and reported in shown
 
 
 STRANGE = {
@@ -153,7 +153,7 @@ def test_octave(tmp_path: Path) -> None:
             for name, server in servers.items()
         )
         graph = harness.Graph("http://127.0.0.1:9", tmp_path)
-        told = octave.values(graph.run(*octave.command(tmp_path, script), timeout=60, LANG="C.UTF-8").stdout)
-    assert list(told) == list(STRANGE)
-    for name, text in told.items():
+        reported = octave.values(graph.run(*octave.command(tmp_path, script), timeout=60, LANG="C.UTF-8").stdout)
+    assert list(reported) == list(STRANGE)
+    for name, text in reported.items():
         assert text.startswith("genomix:connection ") and "\n" not in text, (name, text)

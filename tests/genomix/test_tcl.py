@@ -191,7 +191,7 @@ def test_the_result_of_one_call_is_the_argument_of_another(world: World) -> None
 
 
 @pytest.mark.parametrize(
-    ("command", "told"),
+    ("command", "reported"),
     [
         (
             "GammatoneProc {name g bogus 1}",
@@ -217,7 +217,7 @@ def test_the_result_of_one_call_is_the_argument_of_another(world: World) -> None
         ("ildPort a b", "expected at most one element, got 2 arguments"),
     ],
 )
-def test_refused_arguments_are_named(world: World, command: str, told: str) -> None:
+def test_refused_arguments_are_named(world: World, command: str, reported: str) -> None:
     script = (
         LOAD
         + f"""
@@ -231,9 +231,9 @@ def test_refused_arguments_are_named(world: World, command: str, told: str) -> N
     )
     ex, what, same, background = world.lines(script)
     assert ex == "::genom::serialization"
-    assert told in what
+    assert reported in what
     assert same == "1"
-    assert told in background
+    assert reported in background
 
 
 def test_special_characters_arrive_unchanged_and_are_not_evaluated(world: World) -> None:
@@ -578,7 +578,7 @@ def test_help_has_types_defaults_ranges_and_texts(world: World) -> None:
         puts [bass::Stop -h]
     """
     )
-    told = world.tcl(script).stdout
+    reported = world.tcl(script).stdout
     for line in (
         "rosAFE::PreProc: Condition the input",
         "  pp_bRemoveDC (boolean, default 0): Flag to activate the DC-removal high-pass filter",
@@ -589,7 +589,7 @@ def test_help_has_types_defaults_ranges_and_texts(world: World) -> None:
         "rosAFE::ildPort element: Interaural level differences",
         "bass::Stop: Stop the acquisition\n  no parameters",
     ):
-        assert line in told
+        assert line in reported
     assert "invalid command name" in world.lines(LOAD + "show [lindex [failure {rosAFE::noSuch -h}] 0]\n")[0]
 
 
@@ -714,8 +714,8 @@ def test_background_errors_are_reported_at_the_prompt_of_tclsh(world: World) -> 
         types("set ::genomix::reportDelay 0")
         types("rosAFE::modifyParameter nobody x 1 &")
         types("$g load rosAFE; after 100")
-        told = types("set looked [rosAFE::removeProcessor nobody2 &]")
-        assert "rosAFE::modifyParameter &: ::rosAFE::e_noSuchProcessor: there is no processor 'nobody'" in told
+        reported = types("set looked [rosAFE::removeProcessor nobody2 &]")
+        assert "rosAFE::modifyParameter &: ::rosAFE::e_noSuchProcessor: there is no processor 'nobody'" in reported
         assert "error" in types("$looked wait")
         assert "&:" not in types("rosAFE::getProcessors") and "&:" not in types("rosAFE::getProcessors")
 
@@ -742,8 +742,8 @@ def test_a_lost_server_is_reported_once(world: World) -> None:
             harness.wait_for(lambda: "ready" in client.out, what=lambda: repr(client))
             server.stop()
             assert client.wait(40) == 0
-            told = f"::genom::mwerr: the connection to genomixd at 127.0.0.1:{port} is lost"
-            assert client.out.splitlines() == ["ready", f"bass::Acquire &: {told}"]
+            reported = f"::genom::mwerr: the connection to genomixd at 127.0.0.1:{port} is lost"
+            assert client.out.splitlines() == ["ready", f"bass::Acquire &: {reported}"]
             assert client.err == ""
 
 
@@ -766,5 +766,5 @@ def test_the_default_of_the_highest_channel_depends_on_the_sample_rate_everywher
     assert names == ["filterbank_0", "filterbank_0"]
     assert "use at most 7600 Hz" in refusal
     world.graph.run("rosservice", "call", "/rosAFE/GammatoneProc", "{name: plain, fb_nChannels: 7}")
-    told = world.graph.run("rosservice", "call", "/rosAFE/getParameters", "{}").stdout
-    assert re.findall("fb_highFreqHz: (.*)", told) == ["7600.0"] * 3
+    reported = world.graph.run("rosservice", "call", "/rosAFE/getParameters", "{}").stdout
+    assert re.findall("fb_highFreqHz: (.*)", reported) == ["7600.0"] * 3

@@ -262,8 +262,8 @@ def test_every_request_is_answered(empty_world: World, tmp_path: Path) -> None:
         bass_signal(bass, signal.SIGSTOP)
         with ThreadPoolExecutor() as pool:
             answers = pool.map(hasty.http.raw, ("/call/bass/Stop", "/call/bass/ListDevices"))
-        for status, told in answers:
-            assert status == 502 and "::genom::mwerr" in told and "no answer within 1.5 s" in told
+        for status, reason in answers:
+            assert status == 502 and "::genom::mwerr" in reason and "no answer within 1.5 s" in reason
         bass_signal(bass, signal.SIGCONT)
         world.http.call("bass/Stop")
         assert hasty.http.wait(number, "error")["exception"]["ex"] == "::genom::interrupted"

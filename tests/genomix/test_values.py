@@ -125,7 +125,7 @@ def test_a_single_number_is_a_list_of_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "reason"),
     [
         ({"fb_nERB": 1}, "unknown parameter 'fb_nERB'; GammatoneProc takes name (string)"),
         (
@@ -151,8 +151,8 @@ def test_a_single_number_is_a_list_of_one() -> None:
         (None, "input: expected an object or an array"),
     ],
 )
-def test_errors_name_the_argument_and_the_allowed_values(given: Any, told: str) -> None:
-    assert told in refusal(GAMMATONE, given)
+def test_errors_name_the_argument_and_the_allowed_values(given: Any, reason: str) -> None:
+    assert reason in refusal(GAMMATONE, given)
 
 
 def test_ranges_are_checked_by_the_component() -> None:

@@ -97,7 +97,7 @@ def no_processor(name: str) -> str:
     return f"error ex ::rosAFE::e_noSuchProcessor what {{there is no processor '{name}'; there are: {TREE}}}"
 
 
-WANTED = {
+EXPECTED = {
     "load": "genomix1 1 1",
     "connect before acquisition": "",
     "input without sound": "error ex ::rosAFE::e_noData what {no audio from /bass/Audio: is bass acquiring?}",
@@ -125,9 +125,9 @@ WANTED = {
 }
 
 
-@pytest.mark.parametrize("step", WANTED)
+@pytest.mark.parametrize("step", EXPECTED)
 def test_steps_with_one_answer(walked: tuple[World, dict[str, str]], step: str) -> None:
-    assert walked[1][step] == WANTED[step]
+    assert walked[1][step] == EXPECTED[step]
 
 
 @pytest.mark.parametrize(

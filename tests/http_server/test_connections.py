@@ -143,12 +143,12 @@ def test_half_of_the_connections_of_an_address_may_poll() -> None:
 
 def test_authenticated_connections_are_closed_last() -> None:
     async def check(world: World) -> None:
-        mine = await world.connect()
-        assert await mine.get("/token") == 200
+        authenticated = await world.connect()
+        assert await authenticated.get("/token") == 200
         silent = [await world.connect() for _ in range(7)]
         assert await (await world.connect()).get("/now") == 200  # the ninth connection
         assert await silent[0].reader.read() == b""  # the longest silence of those that are not authenticated
-        assert await mine.get("/now") == 200
+        assert await authenticated.get("/now") == 200
 
     run(check)
 

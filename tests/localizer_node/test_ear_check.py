@@ -23,7 +23,7 @@ AZIMUTHS = {"left": 70.0, "ahead": 5.0, "right": -80.0}  # a person does not sta
 QUIET = 1e-4
 
 
-def heard(gains: tuple[float, float] = (1.0, 1.0), swapped: bool = False) -> dict[str, HeardSound]:
+def measured(gains: tuple[float, float] = (1.0, 1.0), swapped: bool = False) -> dict[str, HeardSound]:
     """Return the sounds from the three directions, with a gain for each channel, of which ears may be swapped."""
     found = {}
     for seed, (direction, azimuth) in enumerate(AZIMUTHS.items()):
@@ -51,7 +51,7 @@ def gain_of(report: EarReport) -> tuple[str, float]:
 
 
 def test_correct_ears() -> None:
-    sounds = heard()
+    sounds = measured()
     report = assess(sounds)
     assert not report.problems and any("not swapped" in line for line in report.lines)
     assert sounds["left"].lead_ms > 0.4 and sounds["right"].lead_ms < -0.4 and abs(sounds["ahead"].lead_ms) < 0.1
@@ -60,13 +60,13 @@ def test_correct_ears() -> None:
 
 
 def test_swapped_ears() -> None:
-    report = assess(heard(swapped=True))
+    report = assess(measured(swapped=True))
     assert report.problems == ("the ears are swapped: exchange the channels",)
 
 
 @pytest.mark.parametrize("gain_db", [-12.0, -6.0, 6.0, 12.0])
 def test_gain(gain_db: float) -> None:
-    report = assess(heard(gains=(10 ** (gain_db / 20), 1.0)))
+    report = assess(measured(gains=(10 ** (gain_db / 20), 1.0)))
     louder, difference = gain_of(report)
     assert louder == ("left" if gain_db > 0 else "right") and difference == pytest.approx(abs(gain_db), abs=1.5)
     (problem,) = report.problems
@@ -75,7 +75,7 @@ def test_gain(gain_db: float) -> None:
 
 @pytest.mark.parametrize(("gains", "ear"), [((0.0, 1.0), "left"), ((1.0, 0.0), "right"), ((1e-3, 1.0), "left")])
 def test_a_silent_ear(gains: tuple[float, float], ear: str) -> None:
-    problems = assess(heard(gains=gains)).problems
+    problems = assess(measured(gains=gains)).problems
     assert problems == (f"the {ear} ear is silent: check its microphone, cable and channel",)
 
 

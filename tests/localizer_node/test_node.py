@@ -199,19 +199,19 @@ def test_two_talkers_and_a_turning_head(
         state = localizer.state(lambda entries: True)
     assert {message.header.frame_id for message in messages} == {"world"}
     begin = first + 3  # certain after a turn of the head
-    heard = [message for message in messages if begin < message.header.stamp.to_sec()]
-    assert len(heard) > 50
+    received = [message for message in messages if begin < message.header.stamp.to_sec()]
+    assert len(received) > 50
     time = np.array([truth.stamp.to_sec() for truth in truths])
     at, errors = [], []
     both = 0
-    for message in heard:
+    for message in received:
         nearest_truth = int(np.abs(time - message.header.stamp.to_sec()).argmin())
         truth = truths[nearest_truth]
         at.append(truth.frameIndex / RATE)
         found = [_distance(present(message), np.degrees(azimuth + truth.head_yaw)) for azimuth in truth.azimuths]
         errors += [error for error in found if error < 15]
         both += max(found) < 10
-    false = np.mean([len(present(message)) > 2 for message in heard])
+    false = np.mean([len(present(message)) > 2 for message in received])
     # The same offline: the talkers pause at the same times.
     scene = read_scene(device.removeprefix("scene:"))
     sound = SceneRenderer(scene).frames(truths[-1].frameIndex)
@@ -225,8 +225,8 @@ def test_two_talkers_and_a_turning_head(
             if abs(t - moment) <= 0.05 and probability > 0.5
         ]
         expected += max(_distance(sources, 45.0), _distance(sources, -40.0)) < 10
-    assert both >= expected - 0.1 * len(heard), (both, expected, len(heard), state)
-    assert both > 0.3 * len(heard) and np.median(errors) < 4 and false < 0.1, (both, np.median(errors), false)
+    assert both >= expected - 0.1 * len(received), (both, expected, len(received), state)
+    assert both > 0.3 * len(received) and np.median(errors) < 4 and false < 0.1, (both, np.median(errors), false)
 
 
 def _distance(azimuths: list[float], azimuth: float) -> float:

@@ -96,8 +96,8 @@ def test_a_change_of(name: str, unchanged: dict[str, Any]) -> None:
         values = {key: value for key, value in {**BASE, name: CHANGES[name]}.items() if KIND_OF[key] == kind}
         stage = STAGES[kind](RATE, **values)
         taken = got[CORE_REPRESENTATIONS[kind].parent] if kind != "input" else SOUND
-        anew = np.concatenate([stage.process(block) for block in cut(taken[..., AT * BLOCK :], BLOCK)], axis=-1)
-        np.testing.assert_array_equal(inner(kind, got[kind], anew.shape)[..., AT * BLOCK :], anew)
+        restarted = np.concatenate([stage.process(block) for block in cut(taken[..., AT * BLOCK :], BLOCK)], axis=-1)
+        np.testing.assert_array_equal(inner(kind, got[kind], restarted.shape)[..., AT * BLOCK :], restarted)
 
 
 def inner(kind: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:

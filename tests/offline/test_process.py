@@ -293,12 +293,12 @@ def test_unneeded_kinds_are_not_computed(kind: str, monkeypatch: pytest.MonkeyPa
     for other in set(STAGES) - set(needed):
         monkeypatch.setitem(STAGES, other, refuse)  # type: ignore[misc]
     results = rosafe.process(SOUND, RATE, parameters=FEW, outputs=[kind])
-    beside = {f"{kind}_time", *(["fb_cfHz"] if "gammatone" in needed else [])}
+    coordinates = {f"{kind}_time", *(["fb_cfHz"] if "gammatone" in needed else [])}
     if kind in FRAMED:
-        beside.add(f"{kind}_frameRate")
+        coordinates.add(f"{kind}_frameRate")
     if kind == "crossCorrelation":
-        beside.add("cc_lags")
-    assert set(results) == {kind} | beside
+        coordinates.add("cc_lags")
+    assert set(results) == {kind} | coordinates
     assert_same(results, {name: whole[name] for name in results}, tolerance=0)
 
 

@@ -81,9 +81,9 @@ def test_one_ear_and_blocks_with_frames_first() -> None:
     assert "ild" not in mono and mono["ratemap"].shape[0] == 1
     lengths = [300, 2, 1, 0, 2, 700]
     ends = np.cumsum(lengths)
-    upright = [SOUND.T[end - length : end] for end, length in zip(ends, lengths, strict=True)]
-    flat = [block.T for block in upright]
-    assert_same(joined(rosafe.Stream(RATE, FEW), upright), joined(rosafe.Stream(RATE, FEW), flat))
+    frames_first = [SOUND.T[end - length : end] for end, length in zip(ends, lengths, strict=True)]
+    flat = [block.T for block in frames_first]
+    assert_same(joined(rosafe.Stream(RATE, FEW), frames_first), joined(rosafe.Stream(RATE, FEW), flat))
     stream = rosafe.Stream(RATE, FEW)
     joined(stream, [SOUND[0]])
     stream.reset()
@@ -98,10 +98,13 @@ def test_blocks_of_16_bits_as_from_sounddevice() -> None:
 
 def test_describe() -> None:
     stream = rosafe.Stream(RATE, FEW, ["ild", "crossCorrelation"])
-    told = stream.describe()
-    assert told["sample_rate"] == RATE and told["parameters"]["fb_highFreqHz"] == told["fb_cfHz"][-1] == 7600.0
-    assert told["axes"] == {"ild": ("channel", "time"), "crossCorrelation": ("channel", "lag", "time")}
-    assert told["units"]["ild"] == "dB" and told["ild_frameRate"] == 100.0 and len(told["cc_lags"]) == 37
+    described = stream.describe()
+    assert (
+        described["sample_rate"] == RATE
+        and described["parameters"]["fb_highFreqHz"] == described["fb_cfHz"][-1] == 7600.0
+    )
+    assert described["axes"] == {"ild": ("channel", "time"), "crossCorrelation": ("channel", "lag", "time")}
+    assert described["units"]["ild"] == "dB" and described["ild_frameRate"] == 100.0 and len(described["cc_lags"]) == 37
 
 
 @pytest.mark.parametrize(

@@ -27,8 +27,8 @@ def test_the_header() -> None:
 
 def test_sections_and_length() -> None:
     sections = re.findall(r"^# (.*)$", BODY, re.MULTILINE)
-    wanted = ["Summary", "Statement of need", "State of the field", "Validation", "Acknowledgements", "References"]
-    assert sections == wanted
+    expected = ["Summary", "Statement of need", "State of the field", "Validation", "Acknowledgements", "References"]
+    assert sections == expected
     assert 250 <= len(BODY.split()) <= 1100
 
 

@@ -28,12 +28,12 @@ def kinds_of(name: str) -> list[str]:
 
 def with_ancestors(outputs: Iterable[str]) -> list[str]:
     """Return the kinds `outputs` and all their ancestors, parents first."""
-    wanted: set[str] = set()
+    needed: set[str] = set()
     for kind in outputs:
-        while kind and kind not in wanted:
-            wanted.add(kind)
+        while kind and kind not in needed:
+            needed.add(kind)
             kind = KINDS[kind].parent
-    return [kind for kind in STAGES if kind in wanted]
+    return [kind for kind in STAGES if kind in needed]
 
 
 def check_resets(fresh: Callable[[int], Stage], given: SignalFormat, x: FloatArray, *others: FloatArray) -> None:
@@ -148,7 +148,7 @@ class Chain:
         `centred` is aligned at its middle.
         """
         changes = list(changes)
-        gathered: dict[str, list[FloatArray]] = {}
+        collected: dict[str, list[FloatArray]] = {}
         blocks = [signal] if sizes is None else cut(signal, sizes)
         for index, block in enumerate(blocks):
             for _, name, value in (change for change in changes if change[0] == index):
@@ -156,8 +156,8 @@ class Chain:
             made = self.process(block)
             for kind in self.outputs:
                 for name, part in zip(part_names(kind), parts_of(made[kind]), strict=True):
-                    gathered.setdefault(name, []).append(part)
-        return {name: _joined(name, parts) for name, parts in gathered.items()}
+                    collected.setdefault(name, []).append(part)
+        return {name: _joined(name, parts) for name, parts in collected.items()}
 
     def coordinates(self) -> dict[str, Any]:
         """Return the coordinates of `outputs`, and `<kind>_frameRate` of framed ones."""

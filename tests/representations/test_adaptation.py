@@ -236,11 +236,11 @@ def test_models_and_effective_values() -> None:
         "adpt_tau": [0.005, 0.05, 0.129, 0.253, 0.5],
         "adpt_model": "",
     }
-    asked = {"adpt_lim": 7.0, "adpt_mindB": 5.0, "adpt_tau": [1.0]}
+    requested = {"adpt_lim": 7.0, "adpt_mindB": 5.0, "adpt_tau": [1.0]}
 
     def in_force(model: str) -> tuple[Any, ...]:
-        values = Adaptation(SOUND, **asked, adpt_model=model).parameters
-        return (*map(values.get, asked), values["adpt_model"])
+        values = Adaptation(SOUND, **requested, adpt_model=model).parameters
+        return (*map(values.get, requested), values["adpt_model"])
 
     even = [0.005, 0.12875, 0.2525, 0.37625, 0.5]
     assert list(EVEN_TAU) == pytest.approx(even)

@@ -53,8 +53,8 @@ def by_scipy(x: FloatArray, centres: list[float], ratio: int, size: int, hop: in
 
 def test_reference_vector() -> None:
     _, expected, got = reference("Q06_amsFeatures_log")
-    wanted = expected["amsFeatures"]
-    np.testing.assert_allclose(got["amsFeatures"], wanted, rtol=0, atol=1e-11 * wanted.max())
+    features = expected["amsFeatures"]
+    np.testing.assert_allclose(got["amsFeatures"], features, rtol=0, atol=1e-11 * features.max())
 
 
 # --- log ----------------------------------------------------------------------------------------------------------

@@ -116,11 +116,11 @@ def test_the_number_of_features(channels: int, count: int) -> None:
 def test_weights_follow_the_definition(channels: int) -> None:
     made, expected = patterns(channels), weights_by_definition(channels)
     assert len(made.places) == len(expected)
-    for (first, number, reach, begin), wanted in zip(made.places.tolist(), expected, strict=True):
+    for (first, number, reach, begin), expected_weights in zip(made.places.tolist(), expected, strict=True):
         dense = np.zeros((channels, 39))
         weights = made.weights[begin : begin + number * (2 * reach + 1)].reshape(number, -1)
         dense[first : first + number, REACH - reach : REACH + reach + 1] = weights
-        np.testing.assert_allclose(dense, wanted[:, ::-1], rtol=0, atol=1e-15)  # W[u] belongs to frame k - u
+        np.testing.assert_allclose(dense, expected_weights[:, ::-1], rtol=0, atol=1e-15)  # W[u] belongs to frame k - u
 
 
 def test_filters() -> None:

@@ -26,10 +26,10 @@ from rosafe.representations.filterbank import Filterbank
     ],
 )
 def test_it_follows_the_sample_rate(rate: float, values: dict[str, Any], highest: float) -> None:
-    told = Filterbank(rate, **values).parameters
-    assert told["fb_highFreqHz"] == highest
-    assert told["fb_cfHz"] == Filterbank(rate, **{**values, "fb_highFreqHz": highest}).parameters["fb_cfHz"]
-    assert max(told["fb_cfHz"]) < rate / 2
+    reported = Filterbank(rate, **values).parameters
+    assert reported["fb_highFreqHz"] == highest
+    assert reported["fb_cfHz"] == Filterbank(rate, **{**values, "fb_highFreqHz": highest}).parameters["fb_cfHz"]
+    assert max(reported["fb_cfHz"]) < rate / 2
 
 
 def test_a_list_takes_precedence() -> None:

@@ -395,7 +395,7 @@ def test_the_fast_path_finds_the_same_peaks(steps: int) -> None:
         curves = rng.integers(-1, steps, (2, 5, size)) / 10
         curves[:, 0] = 0.0
         for some in (curves, curves[:, 1:], curves[:1, 1:2]):
-            got, wanted = pitch.highest_peak(some), pitch._highest_of_plateaus(some)
-            np.testing.assert_array_equal(got[1], wanted[1])
-            found = wanted[1] > 0
-            np.testing.assert_array_equal(got[0][found], wanted[0][found])
+            got, simple = pitch.highest_peak(some), pitch._highest_of_plateaus(some)
+            np.testing.assert_array_equal(got[1], simple[1])
+            found = simple[1] > 0
+            np.testing.assert_array_equal(got[0][found], simple[0][found])

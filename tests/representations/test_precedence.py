@@ -175,9 +175,9 @@ def test_reference_vector() -> None:
 @pytest.mark.parametrize("name", CASES)
 def test_the_result_follows_the_definition(name: str) -> None:
     got, expected = made_and_spelt_out(name)
-    for part, mine, theirs, tolerance in zip(PARTS, got, expected[:3], (1e-15, 1e-10, 1e-11), strict=True):
-        assert mine.shape == theirs.shape
-        np.testing.assert_allclose(mine, theirs, rtol=0, atol=tolerance, err_msg=part)
+    for part, computed, theirs, tolerance in zip(PARTS, got, expected[:3], (1e-15, 1e-10, 1e-11), strict=True):
+        assert computed.shape == theirs.shape
+        np.testing.assert_allclose(computed, theirs, rtol=0, atol=tolerance, err_msg=part)
 
 
 def test_the_cases_cover_all_branches() -> None:
@@ -258,8 +258,8 @@ def test_silence() -> None:
         assert made.shape[-1] > 10 and not made.any()
     stage, fresh = (Precedence(given_signal(3), **framed(60, 60)) for _ in range(2))
     stage.process(np.zeros((2, 3, 600)))  # adds nothing
-    for got, wanted in zip(stage.process(sound(600)), fresh.process(sound(600)), strict=True):
-        np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-11)
+    for got, expected_part in zip(stage.process(sound(600)), fresh.process(sound(600)), strict=True):
+        np.testing.assert_allclose(got, expected_part, rtol=0, atol=1e-11)
     for ear in range(2):
         x = sound(600)
         x[ear] = 0
@@ -347,8 +347,8 @@ def test_reset_and_other_channels_reset_the_state(parameters: dict[str, Any]) ->
     stage = Precedence(given_signal(3), **parameters)
     expected = stage.process(sound(433))
 
-    def same(got: tuple[FloatArray, ...], wanted: tuple[FloatArray, ...]) -> bool:
-        return all(np.array_equal(a, b) for a, b in zip(got, wanted, strict=True))
+    def same(got: tuple[FloatArray, ...], expected_part: tuple[FloatArray, ...]) -> bool:
+        return all(np.array_equal(a, b) for a, b in zip(got, expected_part, strict=True))
 
     stage.process(sound(200, seed=3))
     stage.reset()
@@ -414,8 +414,8 @@ def test_a_change_resets_sums_and_keeps_the_buffer(change: dict[str, Any]) -> No
     assert stage.process(x[..., :410])[0].shape[-1] == 9  # frames at 0 ... 320; the next one at 360
     stage.configure(**change)
     expected = Precedence(given_signal(3), **{**before, **change}).process(x[..., 360:])
-    for got, wanted in zip(stage.process(x[..., 410:]), expected, strict=True):
-        np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-11)
+    for got, expected_part in zip(stage.process(x[..., 410:]), expected, strict=True):
+        np.testing.assert_allclose(got, expected_part, rtol=0, atol=1e-11)
 
 
 def test_changes_in_a_chain() -> None:
@@ -441,8 +441,8 @@ def test_copies_may_be_changed_and_discarded() -> None:
         planned.configure(**framed(70, 11, prec_maxDelaySec=0.004))
         planned.set_input_format(replace(given_signal(3), center_frequencies=(5.0,)))
         made.append(stage.process(block))
-    for got, wanted in zip(joined(made), expected, strict=True):
-        np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-11)
+    for got, expected_part in zip(joined(made), expected, strict=True):
+        np.testing.assert_allclose(got, expected_part, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize(
@@ -465,8 +465,8 @@ def test_invalid_values(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=f"^{name}: "):
         stage.configure(**other, **changes)
     assert stage.parameters == reference_stage.parameters
-    for got, wanted in zip(stage.process(sound(200)), reference_stage.process(sound(200)), strict=True):
-        np.testing.assert_array_equal(got, wanted)
+    for got, expected_part in zip(stage.process(sound(200)), reference_stage.process(sound(200)), strict=True):
+        np.testing.assert_array_equal(got, expected_part)
 
 
 def test_rates_that_are_too_low() -> None:

@@ -75,8 +75,8 @@ def column(strengths: FloatArray, levels: FloatArray, values: dict[str, Any], ra
     """Compute frame k of the map of one ear."""
     reach = reach_of(values, rate)
     first = max(0, k - reach)
-    stretch = slice(first, k + reach + 1)
-    return offline(strengths[:, stretch], levels[:, stretch], values, rate)[:, k - first]
+    segment = slice(first, k + reach + 1)
+    return offline(strengths[:, segment], levels[:, segment], values, rate)[:, k - first]
 
 
 def by_definition(

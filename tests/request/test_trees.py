@@ -62,21 +62,23 @@ def stage(kind: str, parameters: Mapping[str, Any]) -> Stage:
     return STAGES[kind](stage(parent, parameters).output_format if parent else RATE, **own)
 
 
-def check(model: Model, before: Mapping[str, Any], wanted: tuple[str, Mapping[str, Any]], told: dict[str, Any]) -> None:
+def check(
+    model: Model, before: Mapping[str, Any], requested: tuple[str, Mapping[str, Any]], response: dict[str, Any]
+) -> None:
     """The tree is as requested, and only missing processors were created."""
-    representation, parameters = wanted
-    names, state = told["dependencies"], model.state()
-    assert names == list(model.line(told["name"]))[::-1]
+    representation, parameters = requested
+    names, state = response["dependencies"], model.state()
+    assert names == list(model.line(response["name"]))[::-1]
     assert [state[name][0] for name in names] == [
         k.kind for k in request.ancestor_kinds(request.kind_of(representation))
     ]
     for name in names:
         kind, _, values = state[name]
         assert values == in_force(kind, parameters), name
-    assert told["created"] == [name for name in names if name not in before]
-    assert told["reused"] == [name for name in names if name in before]
+    assert response["created"] == [name for name in names if name not in before]
+    assert response["reused"] == [name for name in names if name in before]
     assert {name: state[name] for name in before} == before and set(state) == {*before, *names}
-    for name in told["created"]:
+    for name in response["created"]:
         kind, parent, values = state[name]
         twins = [other for other, known in before.items() if known == (kind, parent, values)]
         assert not twins, f"{name} is {twins} once more"
@@ -104,27 +106,27 @@ def test_any_sequence_of_requests_and_changes(acts: list[tuple[Any, Any]]) -> No
             disturb(model, *act)
             continue
         before = model.state()
-        told = build(model, act[0], **act[1])
-        check(model, before, act, told)
+        response = build(model, act[0], **act[1])
+        check(model, before, act, response)
         again = build(model, act[0], **act[1])
-        assert (again["dependencies"], again["created"]) == (told["dependencies"], [])
+        assert (again["dependencies"], again["created"]) == (response["dependencies"], [])
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(REQUESTS, min_size=2, max_size=5))
-def test_independent_clients(wanted: list[tuple[str, dict[str, Any]]]) -> None:
+def test_independent_clients(requested: list[tuple[str, dict[str, Any]]]) -> None:
     """Concurrent requests without a lock: each gets its processors, and there are no duplicates."""
     model = Model()
 
     async def all_at_once() -> list[dict[str, Any]]:
-        return await asyncio.gather(*(tree_builder.build(model, {"representation": r, **p}) for r, p in wanted))
+        return await asyncio.gather(*(tree_builder.build(model, {"representation": r, **p}) for r, p in requested))
 
     answers = asyncio.run(all_at_once())
-    for (representation, parameters), told in zip(wanted, answers, strict=True):
-        assert [model.processors[name].kind for name in told["dependencies"]] == [
+    for (representation, parameters), response in zip(requested, answers, strict=True):
+        assert [model.processors[name].kind for name in response["dependencies"]] == [
             k.kind for k in request.ancestor_kinds(request.kind_of(representation))
         ]
-        for name in told["dependencies"]:
+        for name in response["dependencies"]:
             processor = model.processors[name]
             assert processor.stage.parameters == in_force(processor.kind, parameters)
     for name, one in model.state().items():
@@ -134,7 +136,7 @@ def test_independent_clients(wanted: list[tuple[str, dict[str, Any]]]) -> None:
 @settings(max_examples=60, deadline=None)
 @given(REQUESTS, REQUESTS, st.integers(0, 20), st.booleans(), st.integers(1, 10))
 def test_a_failed_request_leaves_no_processor(
-    first: tuple[str, dict[str, Any]], wanted: tuple[str, dict[str, Any]], at: int, cancelled: bool, again: int
+    first: tuple[str, dict[str, Any]], requested: tuple[str, dict[str, Any]], at: int, cancelled: bool, again: int
 ) -> None:
     """Rejected and cancelled requests, also if the cleanup is cancelled again."""
     model = Model()
@@ -143,7 +145,7 @@ def test_a_failed_request_leaves_no_processor(
     error = ComponentError("::genom::syserr", code=12)
 
     async def go() -> dict[str, Any]:
-        task = asyncio.create_task(tree_builder.build(model, {"representation": wanted[0], **wanted[1]}))
+        task = asyncio.create_task(tree_builder.build(model, {"representation": requested[0], **requested[1]}))
         if cancelled:
             model.cancel[number] = model.cancel[number + again] = task
         else:
@@ -167,15 +169,15 @@ def test_a_failed_request_leaves_no_processor(
 
 def test_names_are_those_of_the_original_client() -> None:
     model = Model()
-    told = build(model, "ild")
+    response = build(model, "ild")
     chain = ["input_0", "time_0", "filterbank_0", "innerhaircell_0", "ild_0"]
-    assert told["dependencies"] == told["created"] == chain
-    assert (told["name"], told["port"], told["topic"]) == ("ild_0", "ildPort", "/rosAFE/ildPort/ild_0")
-    assert told["reused"] == told["unused"] == []
+    assert response["dependencies"] == response["created"] == chain
+    assert (response["name"], response["port"], response["topic"]) == ("ild_0", "ildPort", "/rosAFE/ildPort/ild_0")
+    assert response["reused"] == response["unused"] == []
     assert build(model, "ratemap")["created"] == ["ratemap_0"]
     assert build(model, "crosscorrelation", cc_maxDelaySec=0.002)["created"] == ["crosscorrelation_0"]
-    told = build(model, "input")
-    assert (told["dependencies"], told["port"], told["topic"]) == (
+    response = build(model, "input")
+    assert (response["dependencies"], response["port"], response["topic"]) == (
         ["input_0"],
         "inputProcPort",
         "/rosAFE/inputProcPort",
@@ -189,8 +191,8 @@ def test_existing_processors_are_reused_and_found(word: str) -> None:
     with pytest.raises(ComponentError, match="missing: InputProc") as missing:
         find(model, word)
     assert missing.value.ex == "::rosAFE::e_noSuchProcessor" and not model.processors
-    told = build(model, word)
-    again = {**told, "created": [], "reused": told["created"]}
+    response = build(model, word)
+    again = {**response, "created": [], "reused": response["created"]}
     assert build(model, word) == find(model, word) == again
     calls = model.calls[:]
     if word not in ("input", "time"):
@@ -230,16 +232,16 @@ def test_the_tree_of_a_user_is_used() -> None:
     """Also if a shorter chain matches as well: existing processors are not created again."""
     model = Model()
     build(model, "input")
-    mine: list[tuple[str, dict[str, Any]]] = [
+    steps: list[tuple[str, dict[str, Any]]] = [
         ("PreProc", {"name": "bare", "upperDepName": "input_0"}),
         ("PreProc", {"name": "preProc", "upperDepName": "input_0"}),
         ("GammatoneProc", {"name": "gammatone", "upperDepName": "preProc", "fb_nChannels": 8}),
     ]
-    for service, values in mine:
+    for service, values in steps:
         defaults = {p.name: p.default for p in ROSAFE.service(service).parameters}
         asyncio.run(model.outputs(service, {**defaults, **values}))
-    told = build(model, "innerhaircell", fb_nChannels=8)
-    assert told["dependencies"] == ["input_0", "preProc", "gammatone", "innerhaircell_0"]
+    response = build(model, "innerhaircell", fb_nChannels=8)
+    assert response["dependencies"] == ["input_0", "preProc", "gammatone", "innerhaircell_0"]
     assert build(model, "time")["name"] == "bare"
 
 
@@ -252,12 +254,12 @@ def test_a_structure_of_getparameters_means_the_processor_that_it_describes(valu
     build(model, "filterbank", fb_type="drnl")
     build(model, "filterbank", **values)
     name, processor = [(n, p) for n, p in model.processors.items() if p.kind == "gammatone"][1]
-    told = {"name": name, **processor.stage.parameters}
-    assert told["name"] == "filterbank_1"
-    structures: tuple[dict[str, Any], ...] = ({"filterbank": told}, {"gammatone": [told]})
+    response = {"name": name, **processor.stage.parameters}
+    assert response["name"] == "filterbank_1"
+    structures: tuple[dict[str, Any], ...] = ({"filterbank": response}, {"gammatone": [response]})
     for structure in structures:
-        wanted = partial({"representation": "ratemap", **structure})
-        assert asyncio.run(tree_builder.build(model, wanted))["dependencies"][2] == "filterbank_1"
+        requested = partial({"representation": "ratemap", **structure})
+        assert asyncio.run(tree_builder.build(model, requested))["dependencies"][2] == "filterbank_1"
     if not values:
         assert build(model, "ratemap", fb_nChannels=31)["dependencies"][2] == "filterbank_2"
 
@@ -288,9 +290,9 @@ def test_zeros_are_literal_and_other_input_parameters_are_set_before_it_has_chil
 def test_the_one_input() -> None:
     model = Model()
     assert build(model, "time", nFramesPerBlock=4410, rm_decaySec=0.1)["unused"] == ["rm_decaySec"]
-    told = build(model, "time", nFramesPerBlock=2205, bufferSize_s_port=2.0, connect="left/Audio")
-    assert told["created"] == []
-    assert told["unused"] == ["nFramesPerBlock", "bufferSize_s_port", "connect"]
+    response = build(model, "time", nFramesPerBlock=2205, bufferSize_s_port=2.0, connect="left/Audio")
+    assert response["created"] == []
+    assert response["unused"] == ["nFramesPerBlock", "bufferSize_s_port", "connect"]
     with pytest.raises(ComponentError, match="in_normalizeValue 2147483647, which modifyParameter") as refused:
         build(model, "time", in_normalizeValue=1)
     assert refused.value.ex == "::rosAFE::e_existsAlready"
@@ -299,7 +301,7 @@ def test_the_one_input() -> None:
 
 
 def test_the_sound() -> None:
-    for named, there, wanted in (
+    for named, there, requested in (
         ("", "", "bass/Audio"),
         ("", "left/Audio", "left/Audio"),
         ("x/y", "left/Audio", "x/y"),
@@ -307,7 +309,7 @@ def test_the_sound() -> None:
         model = Model()
         model.connected = there
         build(model, "input", **({"connect": named} if named else {}))
-        assert model.connected == wanted
+        assert model.connected == requested
     silent = Model(audio=False)
     with pytest.raises(ComponentError) as refused:
         build(silent, "ild")
@@ -412,15 +414,15 @@ def test_a_long_window_costs_nothing() -> None:
 
 
 def test_arguments_by_name_and_structure() -> None:
-    wanted: dict[str, Any] = {"representation": "ild", "fb_nChannels": 16, "fb_cfHz": [100.0, 200.0]}
+    requested: dict[str, Any] = {"representation": "ild", "fb_nChannels": 16, "fb_cfHz": [100.0, 200.0]}
     for form in (
-        wanted,
+        requested,
         ["ild", {"fb_nChannels": "16", "fb_cfHz": {"0": 100, "1": "200"}}],
         {"representation": "ild", "gammatone": {"name": "x", "fb_nChannels": 16}, "fb_cfHz": [100, 200]},
         {"representation": "ild", "filterbank": [{"fb_nChannels": 16, "fb_cfHz": [100, 200]}], "ild": [], "ihc": {}},
-        {**wanted, "fb_nERBs": None, "connect": None},
+        {**requested, "fb_nERBs": None, "connect": None},
     ):
-        assert partial(form) == wanted, form
+        assert partial(form) == requested, form
     for bare in (["ild"], ["ild", {}], ["ild", []], ["ild", ""], ["ild", None]):
         assert partial(bare) == {"representation": "ild"}, bare
     assert partial({"representation": "IHC", "pp_refSPLdBS": 90}) == {"representation": "IHC", "pp_refSPLdB": 90.0}
@@ -486,9 +488,9 @@ _JSON = st.recursive(
 def test_any_input_is_accepted_or_rejected(form: Any) -> None:
     try:
         values = partial(form)
-        wish = request.parse_request(request.kind_of(values.pop("representation")), values)
+        parsed = request.parse_request(request.kind_of(values.pop("representation")), values)
     except ComponentError as refused:
         assert refused.ex in ("::genom::serialization", "::rosAFE::e_badNewValue")
         assert refused.detail["what"]
     else:
-        assert wish.kinds[0] == "input"
+        assert parsed.kinds[0] == "input"

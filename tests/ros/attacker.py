@@ -84,9 +84,9 @@ class Target:
         called = time.monotonic()
         node: Any = xmlrpc.client.ServerProxy(self.api_uri)
         assert node.getPid("/test")[2] == self.process.pid
-        asked = time.monotonic()
+        requested = time.monotonic()
         self.graph.message(f"/{self.name}/genom_state", self._state)
-        return called - begin, asked - called, time.monotonic() - asked
+        return called - begin, requested - called, time.monotonic() - requested
 
     @property
     def descriptors(self) -> int:
@@ -171,7 +171,7 @@ class FakePublisher:
     ----------
     behave : callable
         Called with each connection of a subscriber whose header has been read.
-    asked : callable, optional
+    on_request : callable, optional
         Returns the response of requestTopic for the port; by default a valid one.
     """
 
@@ -181,7 +181,7 @@ class FakePublisher:
         topic: str,
         kind: str,
         behave: Callable[[socket.socket], None],
-        asked: Callable[[int], Any] | None = None,
+        on_request: Callable[[int], Any] | None = None,
         name: str = "/evil_publisher",
     ) -> None:
         self.calls = 0
@@ -201,7 +201,7 @@ class FakePublisher:
 
         def request_topic(*_: Any) -> Any:
             self.calls += 1
-            return asked(port) if asked else (1, "", ["TCPROS", "127.0.0.1", port])
+            return on_request(port) if on_request else (1, "", ["TCPROS", "127.0.0.1", port])
 
         self._listener = Listener(("127.0.0.1", 0), Connection)
         port = self._listener.server_address[1]

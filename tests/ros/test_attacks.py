@@ -226,11 +226,11 @@ def test_the_soft_limit_is_raised(target: Target) -> None:
 def test_without_descriptors_the_node_waits_and_continues(target: Target) -> None:
     """Subscribers that never read use all descriptors; after their end all waiting clients are served."""
     pid = target.process.pid
-    usual = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+    original_limit = resource.prlimit(pid, resource.RLIMIT_NOFILE)
     try:
         with target.needs_no_resources(), ExitStack() as stack:
             limit = target.descriptors + 60
-            resource.prlimit(pid, resource.RLIMIT_NOFILE, (limit, usual[1]))
+            resource.prlimit(pid, resource.RLIMIT_NOFILE, (limit, original_limit[1]))
             for number in range(limit + 50):
                 stack.enter_context(target.subscribe("genom_state", f"/deaf{number}", wait=False))
             wait_for(lambda: target.logged("TCPROS: all"), what=lambda: str(target.process))
@@ -238,7 +238,7 @@ def test_without_descriptors_the_node_waits_and_continues(target: Target) -> Non
             stack.close()
             target.assert_healthy()
     finally:
-        resource.prlimit(pid, resource.RLIMIT_NOFILE, usual)
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, original_limit)
     line = f"TCPROS: all {limit} file descriptors are in use: new connections wait"
     assert target.logged(line) == target.logged("TCPROS: file descriptors for connections are available again") == 1
 
@@ -353,9 +353,9 @@ def test_a_publisher_of_invalid_goals_does_not_affect_other_clients(afe: tuple[S
         for _ in range(2):  # the node connects again
             assert came.acquire(timeout=PATIENCE)
         session.listen()
-        mine = session.goal("InputProc", nFramesPerBlock=1600).active()
+        own_goal = session.goal("InputProc", nFramesPerBlock=1600).active()
         session.ok("Stop")
-        assert mine.result().genom_success
+        assert own_goal.result().genom_success
         target.assert_healthy()
 
 

@@ -250,8 +250,12 @@ def test_parameters_are_returned_exactly(afe: Session) -> None:
     assert list(parameters.gammatone[0].fb_cfHz) == list(truth["fb_cfHz"])
     assert parameters.gammatone[0].fb_nChannels == 3
     assert list(parameters.crossCorrelation[0].cc_lags) == list(truth["cc_lags"])
-    (told_input,) = parameters.input
-    assert (told_input.name, told_input.in_doNormalize, told_input.in_normalizeValue) == ("input", True, 2**31 - 1)
+    (reported_input,) = parameters.input
+    assert (reported_input.name, reported_input.in_doNormalize, reported_input.in_normalizeValue) == (
+        "input",
+        True,
+        2**31 - 1,
+    )
 
 
 # --- dependencies, modification, removal ------------------------------------------------------------------------

@@ -135,11 +135,11 @@ def test_contiguous_and_copied_rows(idl: str, blocks: list[int], frames: int, ro
         ours.left, ours.right = view.select(0), view.select(1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(serialization, "ROW_BYTES", row_bytes)
-        gathered = BufferList()
-        ours.serialize(gathered)
+        buffers = BufferList()
+        ours.serialize(buffers)
         assert serialized(ours) == serialized(plain)
-    assert b"".join(gathered.pieces) == serialized(plain)
-    assert gathered.size == len(serialized(plain))
+    assert b"".join(buffers.pieces) == serialized(plain)
+    assert buffers.size == len(serialized(plain))
 
 
 def test_array_msg_is_the_class_of_a_generated_one() -> None:

@@ -116,13 +116,13 @@ def test_unused_servers_need_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     thread = threading.Thread(target=statuses.run)
     thread.start()
     for _ in range(2):
-        server.in_use, asked = True, server.request_values
+        server.in_use, reads = True, server.request_values
         statuses._in_use.set()
-        wait_for(lambda: server.request_values >= asked + 5)  # noqa: B023
+        wait_for(lambda: server.request_values >= reads + 5)  # noqa: B023
         server.in_use = False
         wait_for(lambda: not statuses._in_use.is_set())
-        asked = server.request_values
-        assert not finished.wait(0.05) and server.request_values <= asked + 1
+        reads = server.request_values
+        assert not finished.wait(0.05) and server.request_values <= reads + 1
     finished.set()
     statuses._in_use.set()
     thread.join()

@@ -45,7 +45,7 @@ def garbage(world: World, chance: random.Random) -> None:
         before = world.counters()["refused"]
         texts = [b"", b"\1", bytes(35), chance.randbytes(3000), bytes(20) + b"\xff" * 64, bytes(8_000_000)]
         silence = np.zeros(1000, np.int32)
-        odd: list[dict[str, Any]] = [
+        invalid: list[dict[str, Any]] = [
             {"sampleRate": 0, "left": silence, "right": silence},
             {"left": silence, "right": silence[1:]},
             {"left": silence[:0], "right": silence[:0]},
@@ -55,11 +55,11 @@ def garbage(world: World, chance: random.Random) -> None:
             message = message_class()
             message.serialize = lambda out, text=text: out.write(text)
             publisher.publish(message)
-        for fields in odd:
-            usual = {"sampleRate": world.size.rate, "nChunksOnPort": 1, "nFramesPerChunk": 1000, "lastFrameIndex": 5}
-            publisher.publish(message_class(**{**usual, **fields}))
-        world.refused += len(texts) + len(odd)
-        world.afe.health(lambda entries: int(entries["refused"]) >= before + len(texts) + len(odd))
+        for fields in invalid:
+            valid = {"sampleRate": world.size.rate, "nChunksOnPort": 1, "nFramesPerChunk": 1000, "lastFrameIndex": 5}
+            publisher.publish(message_class(**{**valid, **fields}))
+        world.refused += len(texts) + len(invalid)
+        world.afe.health(lambda entries: int(entries["refused"]) >= before + len(texts) + len(invalid))
     finally:
         publisher.unregister()
 
@@ -93,9 +93,9 @@ def clients(world: World, chance: random.Random) -> None:
     seed = chance.random()
 
     def work(client: int) -> None:
-        mine = random.Random(f"{seed} {client}")
+        random_numbers = random.Random(f"{seed} {client}")
         for _ in range(25):
-            name = f"client{mine.randrange(8)}"
+            name = f"client{random_numbers.randrange(8)}"
             requests: list[tuple[str, dict[str, Any]]] = [
                 ("GammatoneProc", {"name": name, "fb_nChannels": 2}),
                 ("IhcProc", {"name": f"{name}_ihc", "upperDepName": name}),
@@ -107,7 +107,7 @@ def clients(world: World, chance: random.Random) -> None:
                 ("PreProc", {"name": NAMES["ihc"]}),
                 ("modifyParameter", {"nameProc": name, "nameParam": "fb_nGamma", "newValue": "2"}),
             ]
-            request, fields = mine.choice(requests)
+            request, fields = random_numbers.choice(requests)
             response = world.afe.call(request, **fields)
             if not response.genom_success:
                 error_of(response)

@@ -182,7 +182,7 @@ def test_a_node_that_is_ended_while_it_starts_has_failed(
 
 # --- the rule ---------------------------------------------------------------------------------------------------
 
-MINE, OLD, NEW = "http://127.0.0.1:1/", "http://127.0.0.1:2/", "http://127.0.0.1:3/"
+OWN, OLD, NEW = "http://127.0.0.1:1/", "http://127.0.0.1:2/", "http://127.0.0.1:3/"
 
 
 @contextmanager
@@ -200,8 +200,8 @@ def registered(graph: Graph, address: str) -> Iterator[None]:
     [
         (OLD, False, True),  # the last registration of the old node was late
         (OLD, True, True),
-        (MINE, False, True),  # two nodes start, and this one was registered last
-        (MINE, True, False),  # the new node has not registered yet
+        (OWN, False, True),  # two nodes start, and this one was registered last
+        (OWN, True, False),  # the new node has not registered yet
         (NEW, False, False),
         (NEW, True, False),
     ],
@@ -213,7 +213,7 @@ def test_a_request_to_end_that_is_ignored(graph: Graph, address: str, up: bool, 
     succession.on_contest = lambda: contests.append(True)
     succession.up = up
     with registered(graph, address):
-        assert succession.ignores(MINE) == ignores
+        assert succession.ignores(OWN) == ignores
         assert (succession.over, bool(contests)) == (not ignores, ignores)
 
 

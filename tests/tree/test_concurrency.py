@@ -229,15 +229,15 @@ def test_blocks_are_complete_and_in_order_while_processors_are_added_and_removed
     errors: list[BaseException] = []
 
     def user(seed: int) -> None:
-        mine = random.Random(seed)
+        random_numbers = random.Random(seed)
         try:
             for step in range(150):
                 names = [p.name for p in tree.processors if p.name.startswith(f"{seed}-")]
-                if names and mine.random() < 0.4:
+                if names and random_numbers.random() < 0.4:
                     with contextlib.suppress(ComponentError):  # the other client has removed its parent
-                        tree.remove(mine.choice(names))
+                        tree.remove(random_numbers.choice(names))
                     continue
-                parent = mine.choice([p for p in tree.processors if p.kind != "ild"])
+                parent = random_numbers.choice([p for p in tree.processors if p.kind != "ild"])
                 kind = levels[0] if parent.kind == "input" else levels[levels.index(parent.kind) + 1]
                 try:
                     tree.add(kind, f"{seed}-{step}", parent.name)

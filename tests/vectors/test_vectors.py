@@ -23,12 +23,12 @@ def test_vectors(name: str, block_frames: int | list[int]) -> None:
     signal = expected.pop("signal")
     parameters = {"fb_cfHz": case["cf"], **case.get("parameters", {})}
     got = rosafe.process(signal, case["rate"], parameters=parameters, block_frames=block_frames, outputs=list(expected))
-    for output, wanted in expected.items():
+    for output, reference in expected.items():
         found = make.kept(output, got[output])
-        assert found.shape == wanted.shape, output
-        assert np.abs(wanted).max() > 0, output
-        scale = 1.0 if output in ABSOLUTE else np.abs(wanted).max()
-        error = np.abs(found - wanted).max() / scale
+        assert found.shape == reference.shape, output
+        assert np.abs(reference).max() > 0, output
+        scale = 1.0 if output in ABSOLUTE else np.abs(reference).max()
+        error = np.abs(found - reference).max() / scale
         assert error <= TOLERANCES.get(output, 1e-10), (output, error)
 
 
