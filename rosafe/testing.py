@@ -244,11 +244,11 @@ class _Trial:
         for stages in (copied, untouched):
             self.run(sound[:, :half], [half], stages)
         with _trying("copy.copy of the stage"):
-            twin = copy.copy(copied[-1])
-            assert type(twin) is type(copied[-1]) and vars(twin).keys() == vars(copied[-1]).keys(), "it is not a copy"
-        for name, value in twin.parameters.items():
+            copied_stage = copy.copy(copied[-1])
+            assert type(copied_stage) is type(copied[-1]) and vars(copied_stage).keys() == vars(copied[-1]).keys(), "it is not a copy"
+        for name, value in copied_stage.parameters.items():
             try:
-                twin.configure(**{name: value})
+                copied_stage.configure(**{name: value})
             except PluginError:
                 raise
             except ValueError:

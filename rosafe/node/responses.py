@@ -79,17 +79,17 @@ def _description(processor: Processor, node: str, input_values: Mapping[str, Any
 
 def representation(processor: Processor) -> list[dict[str, Any]]:
     """Return the `rosAFE_representation` structs of a processor's output since the last getRepresentation."""
-    taken = processor.history.read_new("getRepresentation")
+    new_output = processor.history.read_new("getRepresentation")
     return [
         {
             "name": part.name,
-            "rate": taken.signal.rate,
-            "lastFrameIndex": taken.next_index,
+            "rate": new_output.signal.rate,
+            "lastFrameIndex": new_output.next_index,
             "axes": list(part.axes),
             "shape": list(view.shape),
             "data": view.array().ravel(),
         }
-        for part, view in zip(processor.representation.parts, taken.parts, strict=True)
+        for part, view in zip(processor.representation.parts, new_output.parts, strict=True)
     ]
 
 

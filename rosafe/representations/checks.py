@@ -69,35 +69,35 @@ def problem_of(stage: Any, others: Mapping[str, type[Stage]]) -> str:
 
 
 def _problems(stage: Any, others: Mapping[str, type[Stage]]) -> Iterator[str]:
-    mine = stage.REPRESENTATION
+    declared = stage.REPRESENTATION
     try:
-        layout(mine)
+        layout(declared)
     except ValueError as problem:
         yield str(problem)
     yield from _class_problems(stage)
-    if not mine.parent:
+    if not declared.parent:
         yield "parent: expected a kind of processor, got none"
-    if mine.parent not in others:
-        yield f"parent: expected one of {', '.join(others)}, got {mine.parent!r}"
-    for parameter in mine.parameters:
+    if declared.parent not in others:
+        yield f"parent: expected one of {', '.join(others)}, got {declared.parent!r}"
+    for parameter in declared.parameters:
         if parameter.idl not in TYPES:
             yield f"parameters: {parameter.name} is of type {parameter.idl}; expected one of {', '.join(TYPES)}"
-    yield from _reserved_names(mine)
+    yield from _reserved_names(declared)
     for other in others.values():
-        yield from _conflicts(mine, other.REPRESENTATION)
-    yield from _extra_problems(stage, others[mine.parent])
+        yield from _conflicts(declared, other.REPRESENTATION)
+    yield from _extra_problems(stage, others[declared.parent])
 
 
 def _class_problems(stage: Any) -> Iterator[str]:
     """Yield the defects of the class itself."""
-    mine = stage.REPRESENTATION
+    declared = stage.REPRESENTATION
     if not (isinstance(stage, type) and issubclass(stage, Stage)):
         yield f"{stage.__name__}: expected a subclass of Stage or FramedStage"
     yield from _method_problems(stage)
     if issubclass(stage, FramedStage):
         yield from _prefix_problems(stage)
-    if mine.derived and stage.derived is Stage.derived:
-        yield f"derived: {mine.derived[0].name} is declared, but the property derived is missing"
+    if declared.derived and stage.derived is Stage.derived:
+        yield f"derived: {declared.derived[0].name} is declared, but the property derived is missing"
     if not isinstance(stage.EXTRAS, (tuple, list)) or any(bad_name(name) for name in stage.EXTRAS):
         yield f"EXTRAS: expected a tuple of names, got {short_repr(stage.EXTRAS)}"
     for name, kind in (("look_ahead", int), ("required_extra", str)):
@@ -154,30 +154,30 @@ def _results(one: Representation) -> list[str]:
     return [*one.outputs, f"{one.kind}_time", f"{one.kind}_frameRate", *one.coordinates]
 
 
-def _reserved_names(mine: Representation) -> Iterator[str]:
+def _reserved_names(declared: Representation) -> Iterator[str]:
     reserved = {name.lower() for name in (*REQUESTS, *PORTS)}
-    commands = [name.lower() for name in _commands(mine)]
-    for name in _commands(mine):
+    commands = [name.lower() for name in _commands(declared)]
+    for name in _commands(declared):
         if name.lower() in reserved or name.startswith("genom_"):
             yield f"request or port: {name!r} is one of the component's own"
         if commands.count(name.lower()) > 1:
             yield f"request or port: there are two called {name!r}, apart from upper and lower case"
-    if len(mine.parts) > 1 and mine.kind.lower() in {name.lower() for name in STRUCTS}:
-        yield f"kind: {mine.kind!r} is the name of another message"
-    keys = _results(mine)
+    if len(declared.parts) > 1 and declared.kind.lower() in {name.lower() for name in STRUCTS}:
+        yield f"kind: {declared.kind!r} is the name of another message"
+    keys = _results(declared)
     if len(set(keys)) < len(keys):
         yield f"coordinates: two results of rosafe.process would have one name, of {', '.join(keys)}"
 
 
-def _conflicts(mine: Representation, other: Representation) -> Iterator[str]:
+def _conflicts(declared: Representation, other: Representation) -> Iterator[str]:
     """Yield the names in use already. Those of files and commands are compared without regard to case."""
     for what, names in (("kind or word", _words), ("request or port", _commands), ("task", lambda one: (one.task,))):
         taken = {name.lower() for name in names(other)}
-        for name in names(mine):
+        for name in names(declared):
             if name.lower() in taken:
                 yield f"{what}: {other.kind} has {name!r} already"
-    if mine.name == other.name:
-        yield f"name: {other.kind} has {mine.name!r} already"
+    if declared.name == other.name:
+        yield f"name: {other.kind} has {declared.name!r} already"
     for what, keys in (("parameters", lambda one: one.value_names), ("results", _results)):
-        if both := set(keys(mine)) & set(keys(other)):
+        if both := set(keys(declared)) & set(keys(other)):
             yield f"{what}: {other.kind} has {min(both)!r} already"

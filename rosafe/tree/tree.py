@@ -133,8 +133,8 @@ class Tree:
                 with _bad_new_value():
                     stage = STAGES[INPUT](SignalFormat.sound(source.sample_rate, ears), **(parameters or {}))
                     new = Processor(name, stage, None, history_seconds, port_seconds, self._context, source)
-                    heir = old if old is not None and old.state is not State.DONE else new
-                    self._check_memory(preview_subtree(heir, stage), old, max(port_seconds, history_seconds))
+                    root_after = old if old is not None and old.state is not State.DONE else new
+                    self._check_memory(preview_subtree(root_after, stage), old, max(port_seconds, history_seconds))
             except ComponentError:
                 source.stop()
                 raise

@@ -35,7 +35,7 @@ proc ::genomix::Service {client name service args} {
         return [::genomix::ServiceHelp $name $service $about]
     }
     set parameters [dict get $about parameters]
-    if {[::genomix::Asks $args $words $parameters]} {
+    if {[::genomix::AsksForArguments $args $words $parameters]} {
         set words [list [::genomix::Ask $about]]
     }
     set query [dict create input [::genomix::Input $service $about $words]]

@@ -30,7 +30,7 @@ proc ::genomix::about {command} {
 
 # Return whether to ask the user for the arguments of a call: if it was typed at the prompt of eltclsh, has no arguments
 # and no `--`.
-proc ::genomix::Asks {arguments words parameters} {
+proc ::genomix::AsksForArguments {arguments words parameters} {
     return [expr {
         ![llength $words] && [dict size $parameters] && "--" ni $arguments
         && [info commands ::el::typing] ne "" && [uplevel 1 ::el::typing]

@@ -157,7 +157,7 @@ def test_requests_without_line_ends() -> None:
         (b"Read Port - N 5.9 - nfr 1e9\n", (5, 1)),
     ],
 )
-def test_odd_requests(text: bytes, request_: tuple[int, int]) -> None:
+def test_malformed_requests(text: bytes, request_: tuple[int, int]) -> None:
     assert list(take_requests(bytearray(text), quiet=False)) == [request_]
 
 

@@ -45,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here
 
 
-def assert_harmless(done: subprocess.CompletedProcess[str], code: int) -> None:
+def assert_escaped(done: subprocess.CompletedProcess[str], code: int) -> None:
     """Assert the exit code, and that the name was printed in escaped form."""
     output = done.stdout + done.stderr
     assert done.returncode == code and "Traceback" not in output, done
@@ -87,7 +87,7 @@ def test_names_in_commands(
         ended = main(command)
     except SystemExit as end:
         ended = int(str(end.code))
-    assert_harmless(subprocess.CompletedProcess(command, ended, *capsys.readouterr()), code)
+    assert_escaped(subprocess.CompletedProcess(command, ended, *capsys.readouterr()), code)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_names_in_commands(
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
 def test_names_in_commands_that_take_signals(folder: Path, code: int, command: list[str]) -> None:
-    assert_harmless(rosafe(*command, cwd=folder, PYTHONIOENCODING=STRICT), code)
+    assert_escaped(rosafe(*command, cwd=folder, PYTHONIOENCODING=STRICT), code)
 
 
 def test_doctor(folder: Path) -> None:
@@ -129,7 +129,7 @@ def test_names_in_programs_of_a_graph(graph: Graph, folder: Path, code: int, pro
     with graph.start(str(SCRIPTS / program), *options, cwd=folder, PYTHONIOENCODING=STRICT) as process:
         process.wait()
         done = subprocess.CompletedProcess(options, process.wait(), process.out, process.err)
-    assert_harmless(done, code)
+    assert_escaped(done, code)
 
 
 def test_logs_of_a_node(graph: Graph) -> None:

@@ -170,12 +170,12 @@ def decoded(folder: Path, answers: list[bytes]) -> tuple[list[str], float, float
     return lines, float(seconds), int(kilobytes) / 1024
 
 
-def check(folder: Path, answers: list[bytes], wanted: Any) -> None:
+def check(folder: Path, answers: list[bytes], expected: Any) -> None:
     """All have the results `wanted`, quickly and without much memory."""
     lines, seconds, megabytes = decoded(folder, answers)
     assert len(lines) == 2 * len(answers)
     for number, line in enumerate(lines):
-        assert line in wanted, (line, answers[number // 2][:200])
+        assert line in expected, (line, answers[number // 2][:200])
     assert seconds < 20  # of CPU time
     assert megabytes < 500
 

@@ -51,9 +51,9 @@ def test_names_in_the_ros_parameter(
             known = names.Names(ours, "/test_names/names", {"Robot.", "10.0.0.1", "::1"})
             assert known.known == {"robot", "10.0.0.1"}
             assert await known.from_parameter() == ()
-            for value, wanted in (("Ears.lab", {"ears.lab"}), (["one", "two.lab."], {"one", "two.lab"})):
+            for value, expected in (("Ears.lab", {"ears.lab"}), (["one", "two.lab."], {"one", "two.lab"})):
                 master.setParam("/test", "/test_names/names", value)
-                assert await known.from_parameter() == wanted
+                assert await known.from_parameter() == expected
             assert not caplog.messages
             master.setParam("/test", "/test_names/names", ["a b", 7, "three"])
             for _ in range(2):
@@ -74,7 +74,7 @@ def test_names_in_the_ros_parameter(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "namespace", "wanted"),
+    ("arguments", "namespace", "expected"),
     [
         ([], "", "/genomixd/names"),
         (["-v", "__name:=g", "a:=b"], "", "/g/names"),
@@ -82,8 +82,8 @@ def test_names_in_the_ros_parameter(
         (["__ns:=/left"], "robot", "/left/genomixd/names"),
     ],
 )
-def test_the_name_of_the_parameter(arguments: list[str], namespace: str, wanted: str) -> None:
-    assert names.parameter_name(arguments, {"ROS_NAMESPACE": namespace}) == wanted
+def test_the_name_of_the_parameter(arguments: list[str], namespace: str, expected: str) -> None:
+    assert names.parameter_name(arguments, {"ROS_NAMESPACE": namespace}) == expected
 
 
 def test_the_parameter_of_a_genomixd_that_runs(graph: Graph) -> None:

@@ -145,7 +145,7 @@ def test_steps_with_one_answer(walked: tuple[World, dict[str, str]], step: str) 
         ("their ports", "error ex ::genom::no_such_outport"),
     ],
 )
-def test_steps_that_tell_more(walked: tuple[World, dict[str, str]], step: str, part: str) -> None:
+def test_details_of_steps(walked: tuple[World, dict[str, str]], step: str, part: str) -> None:
     assert part in walked[1][step]
 
 

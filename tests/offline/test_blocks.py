@@ -72,10 +72,10 @@ def at_most(size: int) -> Iterator[list[int]]:
         yield lengths
 
 
-def assert_same(got: dict[str, Any], wanted: dict[str, Any]) -> None:
-    assert got.keys() == wanted.keys()
-    for name in wanted:
-        np.testing.assert_array_equal(got[name], wanted[name], err_msg=name)
+def assert_same(got: dict[str, Any], expected: dict[str, Any]) -> None:
+    assert got.keys() == expected.keys()
+    for name in expected:
+        np.testing.assert_array_equal(got[name], expected[name], err_msg=name)
 
 
 @with_kernels

@@ -28,9 +28,9 @@ def joined(stream: rosafe.Stream, blocks: list[Any]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([one[name] for one in made], axis=-1) for name in made[0]}
 
 
-def assert_same(got: dict[str, Any], wanted: dict[str, Any]) -> None:
+def assert_same(got: dict[str, Any], expected: dict[str, Any]) -> None:
     for name, value in got.items():
-        np.testing.assert_array_equal(value, wanted[name], err_msg=name)
+        np.testing.assert_array_equal(value, expected[name], err_msg=name)
 
 
 @settings(deadline=None, max_examples=15)
@@ -52,14 +52,14 @@ def test_changes_on_the_way() -> None:
     changes = [(1, "ihc_method", "bernstein"), (2, "fb_lowFreqHz", 300.0), (3, "set_rm_scailing", "_magnitude")]
     changes += [(4, "rm_hSizeSec", 0.02), (4, "ac_K", 1.0)]
     outputs = ["ihc", "ratemap"]
-    wanted = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=500, modifications=changes, outputs=outputs)
+    expected = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=500, modifications=changes, outputs=outputs)
     stream = rosafe.Stream(RATE, FEW, outputs)
     made = []
     for number, block in enumerate(cut(SOUND, 500)):
         for _, name, value in (change for change in changes if change[0] == number):
             stream.modify(name, value)
         made.append(stream.process(block))
-    assert_same({name: np.concatenate([one[name] for one in made], axis=-1) for name in made[0]}, wanted)
+    assert_same({name: np.concatenate([one[name] for one in made], axis=-1) for name in made[0]}, expected)
     assert stream.describe()["ratemap_frameRate"] == 50.0
     assert stream.describe()["parameters"]["fb_lowFreqHz"] == 300.0
 

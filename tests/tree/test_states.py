@@ -409,7 +409,7 @@ def test_siblings_read_the_same_memory() -> None:
     assert not parent._readers
 
 
-def test_one_that_was_removed_releases_nothing_and_holds_up_nobody() -> None:
+def test_a_removed_processor_releases_nothing_and_blocks_no_other() -> None:
     parent = machine("parent")
     child = machine("child", parent)
     parent.finish_block(block(0))
