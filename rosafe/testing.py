@@ -245,7 +245,9 @@ class _Trial:
             self.run(sound[:, :half], [half], stages)
         with _trying("copy.copy of the stage"):
             copied_stage = copy.copy(copied[-1])
-            assert type(copied_stage) is type(copied[-1]) and vars(copied_stage).keys() == vars(copied[-1]).keys(), "it is not a copy"
+            assert type(copied_stage) is type(copied[-1]) and vars(copied_stage).keys() == vars(copied[-1]).keys(), (
+                "it is not a copy"
+            )
         for name, value in copied_stage.parameters.items():
             try:
                 copied_stage.configure(**{name: value})

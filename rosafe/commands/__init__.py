@@ -11,7 +11,8 @@ option in this list, because argparse cannot assign them.
 
 `rosafe -h` reads the docstrings without importing the modules. Slow imports belong in `run`. `doctor` has to work even
 if numpy is missing. `run` may raise `CommandError` (exit code 1) and may call `options.usage_error(text)` (exit code
-2). Modules whose names begin with an underscore are shared by several commands.
+2). OutputError, MasterError and GenerationError are reported like CommandError. Modules whose names begin with an
+underscore are shared by several commands.
 """
 
 from __future__ import annotations

@@ -14,10 +14,12 @@ from pathlib import Path
 
 from rosafe import commands, missing, streams
 from rosafe.commands import CommandError
+from rosafe.component.generate import GenerationError
 from rosafe.component.startup import Parser, without_names
 from rosafe.declarations import plugins
 from rosafe.output import OutputError
 from rosafe.terminal import printable
+from rosafe.transport.master import MasterError
 from rosafe.version import VERSION
 
 # compute nothing or built-in representations only, or import plugins in a child process
@@ -43,7 +45,7 @@ def main(argv: list[str] | None = None) -> int:
         if rest:
             options.usage_error(f"unrecognized arguments: {' '.join(rest)}")
         return int(options.run(options))
-    except (CommandError, OutputError) as problem:
+    except (CommandError, OutputError, GenerationError, MasterError) as problem:
         print(f"{name}: {printable(problem)}", file=sys.stderr)
         return 1
     except ModuleNotFoundError as problem:

@@ -20,23 +20,20 @@ POLL_SECONDS = 0.2  # between two attempts to reach a component or the master
 
 
 def prepare(wait: float = 0.0) -> None:
-    """Generate the messages and wait at most `wait` seconds for a ROS master. Raises CommandError if either fails."""
+    """Generate the messages and wait at most `wait` seconds for a ROS master; GenerationError or MasterError."""
     from rosafe.component import generate
     from rosafe.transport import master
 
     master.set_local_defaults()
     deadline = time.monotonic() + wait
-    try:
-        generate.ensure_messages()
-        while True:
-            try:
-                return master.check_master(os.environ["ROS_MASTER_URI"])
-            except master.MasterError:
-                if time.monotonic() > deadline:
-                    raise
-            time.sleep(POLL_SECONDS)
-    except (generate.GenerationError, master.MasterError) as problem:
-        raise CommandError(str(problem)) from None
+    generate.ensure_messages()
+    while True:
+        try:
+            return master.check_master(os.environ["ROS_MASTER_URI"])
+        except master.MasterError:
+            if time.monotonic() > deadline:
+                raise
+        time.sleep(POLL_SECONDS)
 
 
 @asynccontextmanager

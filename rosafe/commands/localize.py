@@ -192,14 +192,9 @@ def _run_node(options: argparse.Namespace) -> int:
 
 def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
     """Check the ears, or calibrate the noise level, with the settings of the node."""
-    from rosafe.component.generate import GenerationError
     from rosafe.component.startup import become_node
-    from rosafe.transport.master import MasterError
 
-    try:
-        become_node("rosafe_localize")
-    except (MasterError, GenerationError) as problem:
-        raise CommandError(str(problem)) from None
+    become_node("rosafe_localize")
     from rosafe.localizer_node import ear_check, noise_calibration, noise_measurement
     from rosafe.localizer_node.frame_listener import FrameListener, NoFramesError
     from rosafe.localizer_node.settings import read_settings

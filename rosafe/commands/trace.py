@@ -121,13 +121,9 @@ def _listen(node: str, seconds: float) -> list[Event]:
 
     from rosafe.component.startup import become_node
     from rosafe.node.trace_port import read
-    from rosafe.transport.master import MasterError
 
     messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    try:
-        become_node("rosafe_trace")
-    except MasterError as problem:
-        raise CommandError(str(problem)) from None
+    become_node("rosafe_trace")
     subscriber = rospy.Subscriber(f"{node}/trace", String, messages.put, tcp_nodelay=True)
     events: list[Event] = []
     try:

@@ -15,14 +15,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from rosafe import option_types
-from rosafe.commands import CommandError
 from rosafe.commands._component import format_error, open_graph
 from rosafe.interface import ComponentError
 from rosafe.setups import AcquireSettings, Setup
 
 if TYPE_CHECKING:
     from rosafe.client.component_client import ComponentClient
-    from rosafe.commands._launcher import Launcher, ManagedProcess
+    from rosafe.commands._launcher import Launcher
 
 POLL_SECONDS = 1.0  # between two queries of the state of all nodes
 
@@ -82,12 +81,9 @@ def run(options: argparse.Namespace) -> int:
     setup = without_saved_tree(read_file(options.file), options.keep) if options.file else None
     if options.device:
         setup = replace(setup or Setup(), sound=AcquireSettings.of({"device": options.device}))
-    try:
-        env = environment()
-        master.check_address(env["ROS_MASTER_URI"])
-        generate.ensure_messages()
-    except (generate.GenerationError, master.MasterError) as problem:
-        raise CommandError(str(problem)) from None
+    env = environment()
+    master.check_address(env["ROS_MASTER_URI"])
+    generate.ensure_messages()
     with Launcher(env) as stack:
         asyncio.run(_Session(options, setup, stack).run())
         if sys.stdout.isatty():
@@ -187,14 +183,12 @@ class _Session:
             if client is None or part.state == "ended":
                 continue
             try:
-                part.detail = await (_acquisition if name == "bass" else _tree)(client) + _tree_origin(part)
+                part.detail = await (_acquisition if name == "bass" else _tree)(client) + (
+                    "" if part.child else ", was there"
+                )
                 part.state = "runs"
             except ComponentError as problem:
                 part.state, part.detail = "silent", str(problem)
-
-
-def _tree_origin(part: ManagedProcess) -> str:
-    return "" if part.child is not None else ", was there"
 
 
 async def _acquisition(bass: ComponentClient) -> str:

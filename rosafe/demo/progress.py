@@ -33,7 +33,7 @@ class Progress:
         if now < self._next:
             return
         self._next = now + (REFRESH_SECONDS if self._live else LINE_SECONDS)
-        levels = [report.level_db(samples) for samples in self._recorder.newest_audio(WINDOW_SECONDS)]
+        levels = [report.level_db(samples) for samples in self._recorder.ports["input"].newest(WINDOW_SECONDS)]
         azimuth = self._finder.azimuth if self._finder else float("nan")
         if self._live:
             left, right = (_bar(level) for level in levels)

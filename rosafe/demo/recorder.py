@@ -233,7 +233,3 @@ class PortRecorder:
             ild=series["ild"],
             correlation=series["crossCorrelation"],
         )
-
-    def newest_audio(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the last `seconds` of the left and the right ear, from the port of the input."""
-        return self.ports["input"].newest(seconds)

@@ -199,7 +199,7 @@ class Chain:
                 self._listener.branches[processor] = branch
                 processor.has_consumers = kind in self._outputs
                 if kind in in_place:
-                    processor.output_buffer_for = _input_data
+                    processor.output_buffer_for = lambda block: block.data
 
     def schedule(self, block: int, name: str, value: Any) -> None:
         """Change a (checked) parameter before block `block`. Blocks must ascend from call to call. Or ValueError."""
@@ -384,10 +384,6 @@ def _shares(frequencies: Sequence[float], count: int) -> list[list[float]]:
     count = min(count, groups)
     ends = [kernels.MAX_LANES * (groups * number // count) for number in range(count + 1)]
     return [list(frequencies[first:end]) for first, end in itertools.pairwise(ends)]
-
-
-def _input_data(block: Block) -> np.ndarray:
-    return block.data
 
 
 @contextmanager

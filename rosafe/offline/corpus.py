@@ -199,7 +199,8 @@ def write_failed(folder: Path, inputs: Sequence[Path], failed: Mapping[str, str]
             try:
                 if next(rows, None) != _HEADER:
                     raise csv.Error
-                kept = {row[0]: row[1] for row in rows if len(row) == 2 and not processed & {row[0], *_folders(row[0])}}
+                pairs = (row for row in rows if len(row) == 2)
+                kept = {name: why for name, why in pairs if not processed & {name, *map(str, PurePath(name).parents)}}
             except csv.Error:
                 raise OutputError(f"{path} is not a list of failures; it is left unchanged") from None
     rest = {**kept, **failed}
@@ -209,7 +210,3 @@ def write_failed(folder: Path, inputs: Sequence[Path], failed: Mapping[str, str]
     text = StringIO()
     csv.writer(text, lineterminator="\n").writerows([_HEADER, *rest.items()])
     write_whole(path, text.getvalue().encode("utf-8", "surrogateescape"))
-
-
-def _folders(name: str) -> set[str]:
-    return set(map(str, PurePath(name).parents))

@@ -13,7 +13,7 @@ from rosafe.declarations.representation import Representation
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.plugin_checks import checked
 from rosafe.dsp.stage import Stage
-from rosafe.representations import checks, loading
+from rosafe.representations import checks, plugin_loader
 
 # The processors of the original, in its order, which getParameters and getSignals also use; they report no others.
 CORE_KINDS = ("input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation")
@@ -66,8 +66,8 @@ class _Search:
         self.problems: list[str] = []
         self.warnings: list[str] = []
         offered: list[tuple[str, type[Stage]]] = []
-        for origin, found, path in loading.load(self.problems, self.warnings):
-            names = loading.old_names_used(path)
+        for origin, found, path in plugin_loader.load(self.problems, self.warnings):
+            names = plugin_loader.old_names_used(path)
             stages = [stage for stage in _stages_in(found) if self._declared(origin, stage)]
             if stages and names:
                 self.warnings.append(f"{origin}: uses old names, which the next release removes: {', '.join(names)}")
