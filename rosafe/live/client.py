@@ -164,12 +164,15 @@ class BrowserConnection:
 
     async def _result(self, action: str, values: Mapping[str, Any]) -> dict[str, Any]:
         if action == "look":
-            await self._subscriptions.replace(parse_keys(values), resend=bool(values.get("anew")))
-            self._send_views()
+            await self._subscribe(parse_keys(values), resend=bool(values.get("anew")))
             return {}
         if action not in self._actions:
             raise ValueError(f"unknown request {action[:40]!r}")
         return await self._actions[action](values)
+
+    async def _subscribe(self, keys: list[Key], resend: bool) -> None:
+        await self._subscriptions.replace(keys, resend)
+        self._send_views()
 
     def _send_views(self) -> None:
         self.send_latest("views", {"views": self._subscriptions.describe()})

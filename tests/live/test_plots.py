@@ -222,7 +222,7 @@ def test_a_slow_client_gets_the_newest_columns_and_no_backlog() -> None:
         hub: Any = OneView()
         client = BrowserConnection(hub, {}, lambda: None)
         client._socket = connection
-        await client._subscriptions.replace([Key("picture", "one")])
+        await client._subscribe([Key("picture", "one")], resend=False)
         sender = asyncio.create_task(client._send(connection))
         for first in range(0, 1000, 10):
             view.append(first, np.zeros((1, 10), np.float32), first / 100)
