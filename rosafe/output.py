@@ -148,7 +148,7 @@ def _new_part(target: str | Path, replace: bool, mode: int = 0o666) -> Iterator[
 
 
 @contextmanager
-def new_folder(target: str | Path, replace: bool, sign: str) -> Iterator[Path]:
+def new_folder(target: str | Path, replace: bool, marker_file: str) -> Iterator[Path]:
     """Yield an empty folder that becomes `target` on success and is removed on failure.
 
     As for `AtomicOutput`, its name has the suffix ``.part`` until then, it is locked, and a leftover is overwritten.
@@ -158,8 +158,8 @@ def new_folder(target: str | Path, replace: bool, sign: str) -> Iterator[Path]:
     target : path
         The path of the folder; links are followed.
     replace : bool
-        Whether it may replace an existing folder that contains a file `sign`.
-    sign : str
+        Whether it may replace an existing folder that contains `marker_file`.
+    marker_file : str
         The name of a file by which folders of this kind are recognised.
 
     Raises
@@ -170,7 +170,7 @@ def new_folder(target: str | Path, replace: bool, sign: str) -> Iterator[Path]:
     path = _real(target)
     try:
         if os.path.lexists(path):
-            _check_replaceable(Path(target), path, replace, sign)
+            _check_replaceable(Path(target), path, replace, marker_file)
         elif not path.parent.is_dir():
             raise OutputError(f"cannot write {target}: the folder {path.parent} does not exist")
         part = path.with_name(path.name + PART)
@@ -183,7 +183,7 @@ def new_folder(target: str | Path, replace: bool, sign: str) -> Iterator[Path]:
             if not _is_at(part, descriptor):
                 raise FileNotFoundError(errno.ENOENT, f"{part} has been removed")
             if os.path.lexists(path):
-                _check_replaceable(Path(target), path, replace, sign)
+                _check_replaceable(Path(target), path, replace, marker_file)
                 _exchange(part, path)
             else:
                 _renameat2(part, path, _RENAME_NOREPLACE)
@@ -196,12 +196,12 @@ def new_folder(target: str | Path, replace: bool, sign: str) -> Iterator[Path]:
         raise OutputError(f"cannot write {target}: {problem.strerror or problem}") from problem
 
 
-def _check_replaceable(target: Path, path: Path, replace: bool, sign: str) -> None:
+def _check_replaceable(target: Path, path: Path, replace: bool, marker_file: str) -> None:
     if not path.is_dir():
         raise OutputError(f"{target} already exists and is not a folder")
     if not replace:
         raise OutputError(f"{target} already exists; --force replaces it")
-    if any(path.iterdir()) and not (path / sign).exists():
+    if any(path.iterdir()) and not (path / marker_file).exists():
         raise OutputError(f"{target} is a folder with other contents; it is left unchanged")
 
 

@@ -55,7 +55,7 @@ class Launcher:
     """All processes from the master to the live page, in the environment `env`. Use it as a context manager."""
 
     env: Mapping[str, str]
-    parts: dict[str, ManagedProcess] = field(default_factory=dict)
+    processes: dict[str, ManagedProcess] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._children = ProcessGroup(self.env)  # nodes and servers
@@ -73,35 +73,35 @@ class Launcher:
     @property
     def ended(self) -> list[ManagedProcess]:
         """Processes that were started here and have ended by themselves."""
-        for part in self.parts.values():
-            part.poll()
-        return [part for part in self.parts.values() if part.state == "ended"]
+        for process in self.processes.values():
+            process.poll()
+        return [process for process in self.processes.values() if process.state == "ended"]
 
     def start(self, name: str, *command: str, master: bool = False) -> ManagedProcess:
         """Start one of the commands."""
         children = self._masters if master else self._children
-        part = self.parts[name] = ManagedProcess(name, child=children.start(*command))
-        return part
+        process = self.processes[name] = ManagedProcess(name, child=children.start(*command))
+        return process
 
     async def start_master(self) -> None:
         """Use the running ROS master or start one. Raises CommandError if neither is possible."""
         uri = self.env["ROS_MASTER_URI"]
         if await _answers(uri):
-            self.parts["roscore"] = ManagedProcess("roscore", "runs", f"{uri}, was there")
+            self.processes["roscore"] = ManagedProcess("roscore", "runs", f"{uri}, was there")
             return
         if not master.is_local(uri):
             raise CommandError(f"no ROS master at {uri}; start roscore on that machine")
-        part = self.start("roscore", "roscore", "-p", str(urlsplit(uri).port or 11311), master=True)
-        await self._until(part, lambda: _answers(uri))
-        part.detail = uri
+        process = self.start("roscore", "roscore", "-p", str(urlsplit(uri).port or 11311), master=True)
+        await self._until(process, lambda: _answers(uri))
+        process.detail = uri
 
     async def start_node(self, graph: Graph, name: str, *options: str) -> ComponentClient | None:
         """Use the running component `name` or start it. Return a client of it, or None if it does not start."""
-        running = await _client(graph, name) if self.parts["roscore"].child is None else None
+        running = await _client(graph, name) if self.processes["roscore"].child is None else None
         if running is not None:
-            self.parts[name] = ManagedProcess(name, "runs", "was there")
+            self.processes[name] = ManagedProcess(name, "runs", "was there")
             return running
-        part = self.start(name, paths.program(f"{name}-ros"), *options)
+        process = self.start(name, paths.program(f"{name}-ros"), *options)
         found: list[ComponentClient] = []
 
         async def is_up() -> bool:
@@ -109,63 +109,63 @@ class Launcher:
             found.extend([client] if client is not None else [])
             return client is not None
 
-        await self._until(part, is_up)
+        await self._until(process, is_up)
         return found[0] if found else None
 
     async def start_genomixd(self, port: int) -> None:
         """Use the running genomixd on `port` or start one."""
         url = f"http://127.0.0.1:{port}"
         if await _is_genomixd(url):
-            self.parts["genomixd"] = ManagedProcess("genomixd", "runs", f"{url}, was there")
+            self.processes["genomixd"] = ManagedProcess("genomixd", "runs", f"{url}, was there")
             return
-        part = self.start("genomixd", paths.program("genomixd"), "-p", str(port))
-        await self._until(part, lambda: _is_genomixd(url))
-        if part.state == "runs":
-            part.detail = url
+        process = self.start("genomixd", paths.program("genomixd"), "-p", str(port))
+        await self._until(process, lambda: _is_genomixd(url))
+        if process.state == "runs":
+            process.detail = url
 
     async def start_localizer(self, graph: Graph, settings: Mapping[str, Any]) -> None:
         """Use the running localizer or start one with these settings."""
         from rosafe.client import localizer
 
-        if self.parts["roscore"].child is None and await localizer.is_registered(graph):
-            self.parts["localizer"] = ManagedProcess("localizer", "runs", "was there")
+        if self.processes["roscore"].child is None and await localizer.is_registered(graph):
+            self.processes["localizer"] = ManagedProcess("localizer", "runs", "was there")
             return
         await localizer.set_parameters(graph, settings)
-        part = self.start("localizer", paths.program("rosafe"), "localize")
-        await self._until(part, lambda: localizer.is_registered(graph))
-        if part.state == "runs":
-            part.detail = f"head: {settings.get('head', 'sphere')}"
+        process = self.start("localizer", paths.program("rosafe"), "localize")
+        await self._until(process, lambda: localizer.is_registered(graph))
+        if process.state == "runs":
+            process.detail = f"head: {settings.get('head', 'sphere')}"
 
     async def start_page(self, port: int, browser: bool) -> None:
         """Start the server of the live page."""
         options = ["--port", str(port), *(() if browser else ("--no-browser",))]
-        part = self.start("page", paths.program("rosafe"), "live", *options)
+        process = self.start("page", paths.program("rosafe"), "live", *options)
 
         async def prints_url() -> bool:
-            return part.child is not None and bool(_URL.search(part.child.out))
+            return process.child is not None and bool(_URL.search(process.child.out))
 
-        await self._until(part, prints_url)
-        if part.child is not None and (url := _URL.search(part.child.out)):
-            part.detail = url[0]
+        await self._until(process, prints_url)
+        if process.child is not None and (url := _URL.search(process.child.out)):
+            process.detail = url[0]
 
-    async def _until(self, part: ManagedProcess, condition: Callable[[], Awaitable[bool]]) -> None:
+    async def _until(self, process: ManagedProcess, condition: Callable[[], Awaitable[bool]]) -> None:
         deadline = asyncio.get_running_loop().time() + START_SECONDS
         while True:
-            part.poll()
-            if part.state == "ended":
+            process.poll()
+            if process.state == "ended":
                 return
             if await condition():
-                part.state = "runs"
+                process.state = "runs"
                 return
             if asyncio.get_running_loop().time() > deadline:
-                part.state, part.detail = "late", f"not up after {START_SECONDS:g} s"
+                process.state, process.detail = "late", f"not up after {START_SECONDS:g} s"
                 return
             await asyncio.sleep(POLL_SECONDS)
 
     def lines(self) -> Iterator[str]:
         """Yield the lines of the screen."""
-        for part in self.parts.values():
-            yield printable(f"{part.name:9} {part.state:7} {part.detail}".rstrip())
+        for process in self.processes.values():
+            yield printable(f"{process.name:9} {process.state:7} {process.detail}".rstrip())
 
 
 async def _answers(uri: str) -> bool:

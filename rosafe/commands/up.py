@@ -84,12 +84,12 @@ def run(options: argparse.Namespace) -> int:
     env = environment()
     master.check_address(env["ROS_MASTER_URI"])
     generate.ensure_messages()
-    with Launcher(env) as stack:
-        asyncio.run(_Session(options, setup, stack).run())
+    with Launcher(env) as launcher:
+        asyncio.run(_Session(options, setup, launcher).run())
         if sys.stdout.isatty():
             print("ending the processes that were started here", flush=True)
-        refused = any(part.state == "refused" for part in stack.parts.values())
-        return int(refused or bool(stack.ended))
+        refused = any(process.state == "refused" for process in launcher.processes.values())
+        return int(refused or bool(launcher.ended))
 
 
 def _localizer_settings(options: argparse.Namespace, setup: Setup | None) -> dict[str, Any] | None:
@@ -104,10 +104,10 @@ def _localizer_settings(options: argparse.Namespace, setup: Setup | None) -> dic
 class _Session:
     """One run of the command."""
 
-    def __init__(self, options: argparse.Namespace, setup: Setup | None, stack: Launcher) -> None:
+    def __init__(self, options: argparse.Namespace, setup: Setup | None, launcher: Launcher) -> None:
         self._options = options
         self._setup = setup
-        self._stack = stack
+        self._launcher = launcher
         self._screen = _Screen(sys.stdout.isatty())
         self._end = asyncio.Event()
 
@@ -129,30 +129,30 @@ class _Session:
             for task in (work, end, show):
                 task.cancel()
             await asyncio.gather(work, end, show, return_exceptions=True)
-            self._screen.show(self._stack.lines())
+            self._screen.show(self._launcher.lines())
 
     async def _show(self) -> None:
         while True:
-            for part in self._stack.parts.values():
-                part.poll()
-            self._screen.show(self._stack.lines())
+            for process in self._launcher.processes.values():
+                process.poll()
+            self._screen.show(self._launcher.lines())
             await asyncio.sleep(POLL_SECONDS / 4)
 
     async def _work(self) -> None:
-        options, stack = self._options, self._stack
-        await stack.start_master()
+        options, launcher = self._options, self._launcher
+        await launcher.start_master()
         async with open_graph() as graph:
             keep = ("--keep", options.keep) if options.keep else ()
             bass, afe, _ = await asyncio.gather(
-                stack.start_node(graph, "bass"),
-                stack.start_node(graph, "rosAFE", *keep),
-                stack.start_genomixd(options.port),
+                launcher.start_node(graph, "bass"),
+                launcher.start_node(graph, "rosAFE", *keep),
+                launcher.start_genomixd(options.port),
             )
             await self._load(afe)
             if (settings := _localizer_settings(options, self._setup)) is not None:
-                await stack.start_localizer(graph, settings)
+                await launcher.start_localizer(graph, settings)
             if options.live:
-                await stack.start_page(options.live_port, not options.no_browser)
+                await launcher.start_page(options.live_port, not options.no_browser)
             self._screen.say("Press Ctrl-C to end the processes that were started here")
             while True:
                 await self._poll(bass, afe)
@@ -165,30 +165,30 @@ class _Session:
         if self._setup is None:
             return
         name = self._options.file or self._options.device
-        part = self._stack.parts["setup"] = ManagedProcess("setup", "loads", name)
+        process = self._launcher.processes["setup"] = ManagedProcess("setup", "loads", name)
         if afe is None:
-            part.state, part.detail = "refused", "rosAFE is not running"
+            process.state, process.detail = "refused", "rosAFE is not running"
             return
         try:
             answer = await setup_transaction.apply(afe, self._setup, wait=10.0)
-            part.state = "loaded"
-            part.detail = f"{name}: {len(answer['created'])} created, {len(answer['reused'])} reused"
+            process.state = "loaded"
+            process.detail = f"{name}: {len(answer['created'])} created, {len(answer['reused'])} reused"
         except ComponentError as problem:
-            part.state, part.detail = "refused", format_error(problem)
+            process.state, process.detail = "refused", format_error(problem)
 
     async def _poll(self, bass: ComponentClient | None, afe: ComponentClient | None) -> None:
         """Update the states of the nodes."""
         for name, client in (("bass", bass), ("rosAFE", afe)):
-            part = self._stack.parts[name]
-            if client is None or part.state == "ended":
+            process = self._launcher.processes[name]
+            if client is None or process.state == "ended":
                 continue
             try:
-                part.detail = await (_acquisition if name == "bass" else _tree)(client) + (
-                    "" if part.child else ", was there"
+                process.detail = await (_acquisition if name == "bass" else _tree)(client) + (
+                    "" if process.child else ", was there"
                 )
-                part.state = "runs"
+                process.state = "runs"
             except ComponentError as problem:
-                part.state, part.detail = "silent", str(problem)
+                process.state, process.detail = "silent", str(problem)
 
 
 async def _acquisition(bass: ComponentClient) -> str:

@@ -76,15 +76,17 @@ class Request:
         if self.output_size > KEPT_BYTES:
             self.value, self._output_included = NOTHING, False
 
-    def pieces(self, form: Syntax) -> Iterator[str]:
+    def pieces(self, syntax: Syntax) -> Iterator[str]:
         """Yield the status as text: id, status, warning, and output or exception, if there are any."""
-        yield form.open("struct")
+        yield syntax.open("struct")
         status = self._status_members()
-        yield "".join(form.key(index, name) + plain(form, value) for index, (name, value) in enumerate(status.items()))
+        yield "".join(
+            syntax.key(index, name) + plain(syntax, value) for index, (name, value) in enumerate(status.items())
+        )
         if self._has_output:
-            yield form.key(len(status), "output")
-            yield from text_formats.structure(form, *self.value.content)
-        yield form.close("struct")
+            yield syntax.key(len(status), "output")
+            yield from text_formats.structure(syntax, *self.value.content)
+        yield syntax.close("struct")
 
     def packed(self) -> Iterator[bytes]:
         """Yield the status in the binary format."""

@@ -321,7 +321,7 @@ class HttpApi:
         return response
 
 
-async def _send_events(request: web.Request, session: Session, form: Syntax) -> web.StreamResponse:
+async def _send_events(request: web.Request, session: Session, syntax: Syntax) -> web.StreamResponse:
     """Send the events of a session to a listener until the session ends."""
     queue = session.listen()
     try:
@@ -335,9 +335,9 @@ async def _send_events(request: web.Request, session: Session, form: Syntax) -> 
                 await response.write(b":\n\n")
                 continue
             if isinstance(data, Request):
-                data = "".join(_unwrapped(form, data.pieces(form)))
+                data = "".join(_unwrapped(syntax, data.pieces(syntax)))
             elif data:
-                data = _plain_text(form, data)
+                data = _plain_text(syntax, data)
             await response.write(_utf8(f"event: {event}\ndata: {data}\n\n"))
             if event == "quit":
                 return response
@@ -401,9 +401,9 @@ def _utf8(text: str) -> bytes:
     return text.encode("utf-8", "backslashreplace")
 
 
-def _unwrapped(form: Syntax, pieces: Iterator[str]) -> Iterator[str]:
+def _unwrapped(syntax: Syntax, pieces: Iterator[str]) -> Iterator[str]:
     """Yield a complete document: without the outermost braces in Tcl, which would make it a list of one element."""
-    if form is not TCL:
+    if syntax is not TCL:
         yield from pieces
         return
     previous = next(pieces)[1:]
@@ -413,17 +413,17 @@ def _unwrapped(form: Syntax, pieces: Iterator[str]) -> Iterator[str]:
     yield previous[:-1]
 
 
-def _plain_text(form: Syntax, value: Any) -> str:
+def _plain_text(syntax: Syntax, value: Any) -> str:
     """Return the complete document of a small value without a type."""
-    return "".join(_unwrapped(form, iter((plain(form, value),))))
+    return "".join(_unwrapped(syntax, iter((plain(syntax, value),))))
 
 
 def _encoded(request: web.Request, value: Value | Request) -> Iterator[bytes]:
     if _is_packed(request):
         return value.packed() if isinstance(value, Request) else binary_format.structure(*value.content)
-    form = _syntax(request)
-    pieces = value.pieces(form) if isinstance(value, Request) else structure(form, *value.content)
-    return (_utf8(piece) for piece in _unwrapped(form, pieces))
+    syntax = _syntax(request)
+    pieces = value.pieces(syntax) if isinstance(value, Request) else structure(syntax, *value.content)
+    return (_utf8(piece) for piece in _unwrapped(syntax, pieces))
 
 
 def _media_type(request: web.Request) -> str:

@@ -110,11 +110,11 @@ def process_file(
         written.
     """
     values, kinds = check_parameters(parameters), check_outputs(OUTPUTS if outputs is None else outputs)
-    form = format_of(target)
-    check_format(form, kinds)
+    file_format = format_of(target)
+    check_format(file_format, kinds)
     about = _options_of(source, block_frames, channels, topic, pad, clip)
     if resume and os.path.lexists(target):
-        if _complete(form, Path(target), about, values, kinds) and not _source_modified(source, target):
+        if _complete(file_format, Path(target), about, values, kinds) and not _source_modified(source, target):
             return FileResult(0.0, 0, True)
         replace = True
     one_ear = outputs is not None and not any(KINDS[kind].binaural for kind in kinds)
@@ -123,9 +123,9 @@ def process_file(
             raise OutputError(f"{target} is the input file")
         if sound.floats:
             values.setdefault("in_doNormalize", False)
-        with new_output(form, target, replace) as path:
-            empty = _FileRun(sound, path, form, about, values, kinds, progress).run()
-            size = sum(part.stat().st_size for part in path.rglob("*")) if form.folder else path.stat().st_size
+        with new_output(file_format, target, replace) as path:
+            empty = _FileRun(sound, path, file_format, about, values, kinds, progress).run()
+            size = sum(part.stat().st_size for part in path.rglob("*")) if file_format.folder else path.stat().st_size
         return FileResult(sound.frames / sound.sample_rate, size, False, sound.not_finite, sound.clipped, empty)
 
 
@@ -145,13 +145,13 @@ def _options_of(
 
 
 def _complete(
-    form: Format, target: Path, about: Mapping[str, Any], values: Mapping[str, Any], kinds: Sequence[str]
+    file_format: Format, target: Path, about: Mapping[str, Any], values: Mapping[str, Any], kinds: Sequence[str]
 ) -> bool:
     """Return whether the output exists and is complete; OutputError if it is a different file."""
     try:
-        existing = read(form, target, arrays=False)
+        existing = read(file_format, target, arrays=False)
     except ValueError:
-        if form.is_one(target):
+        if file_format.is_one(target):
             return False
         raise OutputError(f"{target} is not a result of rosafe process; --force replaces it") from None
     except OSError as problem:
@@ -182,13 +182,13 @@ class _FileRun:
         self,
         sound: SoundReader,
         path: Path,
-        form: Format,
+        file_format: Format,
         about: Mapping[str, Any],
         values: Mapping[str, Any],
         kinds: list[str],
         progress: Callable[[int, int], None],
     ) -> None:
-        self._sound, self._path, self._form, self._kinds, self._values = sound, path, form, kinds, values
+        self._sound, self._path, self._format, self._kinds, self._values = sound, path, file_format, kinds, values
         self._about = about
         self._progress = progress
         self._padding = 0
@@ -206,7 +206,7 @@ class _FileRun:
             sizes.check_memory(sizes.MAX_BYTES, taken, f"{kind}: {_TOO_LARGE}", 1e9)  # several exist at a time
             self._padding = chain.padding(sound.frames) if "pad" in self._about else 0
             contents = self._contents(chain)
-            writer_class = self._form.writer(contents)
+            writer_class = self._format.writer(contents)
             _check_disk_space(self._path, writer_class.size(contents))
             with closing(writer_class(self._path, contents)) as self._writer:
                 chain.run(merge=True)

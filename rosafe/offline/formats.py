@@ -87,7 +87,7 @@ FORMATS = {
         Format(".npz", lambda contents: NpzWriter, read_npz, b"PK"),
         Format(".h5", lambda contents: H5Writer, read_h5, b"\x89HDF", "h5py"),
         Format(".mat", _mat_writer, _read_mat, b"MATLAB"),
-        Format(".zarr", lambda contents: ZarrWriter, read_zarr, module="zarr", folder=ZarrWriter.SIGN),
+        Format(".zarr", lambda contents: ZarrWriter, read_zarr, module="zarr", folder=ZarrWriter.MARKER_FILE),
         Format(".csv", lambda contents: CsvWriter, read_csv, b"# rosafe"),
     )
 }
@@ -101,11 +101,11 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     return FORMATS[extension]
 
 
-def check_format(form: Format, outputs: Iterable[str]) -> None:
+def check_format(file_format: Format, outputs: Iterable[str]) -> None:
     """Raise ValueError if a format cannot store these outputs, or ModuleNotFoundError if its package is missing."""
-    if form.module:
-        require(form.module, f"{form.extension} files")
-    if form.extension == ".csv":
+    if file_format.module:
+        require(file_format.module, f"{file_format.extension} files")
+    if file_format.extension == ".csv":
         parts = [part for kind in outputs for part in KINDS[kind].outputs.values()]
         if len(parts) != 1 or len(parts[0].axes) != 2:
             possible = [kind for kind, one in KINDS.items() if [len(p.axes) for p in one.outputs.values()] == [2]]
@@ -139,8 +139,8 @@ def load(path: str | os.PathLike[str]) -> Result:
     ModuleNotFoundError
         h5py or zarr is not installed.
     """
-    form = format_of(path)
-    result = read(form, Path(path))
+    file_format = format_of(path)
+    result = read(file_format, Path(path))
     try:
         _check_arrays(result)
     except ValueError as problem:
@@ -162,8 +162,8 @@ def load(path: str | os.PathLike[str]) -> Result:
 
 def save(result: Result, path: str | os.PathLike[str]) -> None:
     """Write a result to a file, which is replaced if it exists; see `Result.save`."""
-    form = format_of(path)
-    check_format(form, result.kinds)
+    file_format = format_of(path)
+    check_format(file_format, result.kinds)
     axes, units = result.axes, result.units
     times = {f"{kind}_time" for kind in result.kinds if f"{kind}_frameRate" not in result}  # of samples: not stored
     coordinates = {name: value for name, value in result.items() if name in units.keys() - axes.keys() - times}
@@ -181,16 +181,16 @@ def save(result: Result, path: str | os.PathLike[str]) -> None:
         {name: value for name, value in coordinates.items() if name not in names},
         about,
     )
-    writer_class = form.writer(contents)
-    with new_output(form, path, replace=True) as place, closing(writer_class(place, contents)) as writer:
+    writer_class = file_format.writer(contents)
+    with new_output(file_format, path, replace=True) as place, closing(writer_class(place, contents)) as writer:
         for name in axes:
             writer.append(name, np.asarray(result[name], np.float64))
         writer.finish()
 
 
-def new_output(form: Format, path: str | os.PathLike[str], replace: bool) -> AbstractContextManager[Path]:
+def new_output(file_format: Format, path: str | os.PathLike[str], replace: bool) -> AbstractContextManager[Path]:
     """Return a context that yields an empty file or folder, which becomes `path` on success."""
-    return new_folder(Path(path), replace, form.folder) if form.folder else new_path(Path(path), replace)
+    return new_folder(Path(path), replace, file_format.folder) if file_format.folder else new_path(Path(path), replace)
 
 
 def _check_arrays(result: Mapping[str, Any]) -> None:
@@ -240,18 +240,18 @@ def _check_array(name: str, value: Any, dimensions: int) -> None:
         raise ValueError(f"{short_repr(name)}: expected {dimensions} axes, got the shape {value.shape}")
 
 
-def read(form: Format, path: Path, arrays: bool = True) -> dict[str, Any]:
+def read(file_format: Format, path: Path, arrays: bool = True) -> dict[str, Any]:
     """Return the contents of a file; without `arrays`, only the metadata. Raises the errors of `load`."""
     if not path.exists():
         raise FileNotFoundError(2, os.strerror(2), str(path))
-    if form.module and not importlib.util.find_spec(form.module):  # the child process imports it
-        require(form.module, f"{form.extension} files")
-    if form.folder and not path.is_dir():
+    if file_format.module and not importlib.util.find_spec(file_format.module):  # the child process imports it
+        require(file_format.module, f"{file_format.extension} files")
+    if file_format.folder and not path.is_dir():
         raise ValueError(f"{path}: expected a directory, got a file")
-    if not form.folder:
+    if not file_format.folder:
         os.close(open_descriptor(path))  # HDF5 would open other files than regular ones
     try:
-        result = checked(form.read(path, arrays))
+        result = checked(file_format.read(path, arrays))
     except (ValueError, OverflowError, RecursionError, MemoryError) as problem:  # json.JSONDecodeError, too
         raise ValueError(f"{path} is not a result of rosafe process, or damaged: {problem}") from None
     for name in ("axes", "parameters", "sample_rate"):

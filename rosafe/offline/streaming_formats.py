@@ -177,7 +177,7 @@ class Mat73Writer(_Hdf5Writer):
 class ZarrWriter(ChunkedWriter):
     """Zarr, format 2, as a folder, with the names of dimensions that xarray expects."""
 
-    SIGN = ".zgroup"  # a file that each such folder contains
+    MARKER_FILE = ".zgroup"  # a file that each such folder contains
 
     def _create(self) -> None:
         try:
