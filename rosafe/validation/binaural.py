@@ -38,8 +38,7 @@ def level_differences(process: Process) -> Measured:
         signal = noise(4000) * np.array([[1.0], [10 ** (difference / 20)]])
         values = process(signal, RATE, {}, ["ild"])["ild"]
         measured.append(values.flat[np.argmax(np.abs(values - difference))])
-    curve = Curve(expected, expected, measured, "level difference (dB)", "ILD (dB)")
-    return Measured(largest(np.array(measured) - expected), curve)
+    return Measured.of(expected, expected, measured, "level difference (dB)", "ILD (dB)")
 
 
 @ROWS.add(
@@ -103,8 +102,7 @@ def coherence(process: Process) -> Measured:
     for correlation in expected:
         signal = np.stack((common, correlation * common + np.sqrt(1 - correlation**2) * other))
         measured.append(process(signal, RATE, parameters, ["ic"])["ic"].mean())
-    curve = Curve(expected, expected, measured, "correlation", "IC")
-    return Measured(largest(np.array(measured) - expected), curve)
+    return Measured.of(expected, expected, measured, "correlation", "IC")
 
 
 def lead_and_lag(itd: float, level_db: float) -> FloatArray:
@@ -164,8 +162,7 @@ def click_pairs(process: Process) -> Measured:
         frames = np.flatnonzero(levels > 0.3 * levels.max())
         found.append(float(np.median(result["precedence_itd"][channels][:, frames[frames > 10]])))
     measured, expected = 1e6 * np.array(found), np.full(len(delays), 1e6 * itd)
-    curve = Curve(delays, expected, measured, "delay of the second click (ms)", "ITD (µs)")
-    return Measured(largest(measured - expected), curve)
+    return Measured.of(delays, expected, measured, "delay of the second click (ms)", "ITD (µs)")
 
 
 def _clicks(itd: float, delay: float) -> FloatArray:

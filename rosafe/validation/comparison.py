@@ -16,6 +16,7 @@ from rosafe.declarations.reference import Reference
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.offline.result import Result
+from rosafe.validation.stimuli import largest
 
 KEMAR = Path("/usr/share/libmysofa/default.sofa")  # MIT KEMAR, in Debian's libmysofa1
 
@@ -41,6 +42,14 @@ class Measured:
 
     deviation: float
     curve: Curve | None = None
+
+    @classmethod
+    def of(
+        cls, x: Any, expected: Any, measured: Any, x_label: str, y_label: str, logarithmic: bool = False
+    ) -> Measured:
+        """Return the largest difference of two curves, with both of them."""
+        curve = Curve(x, expected, measured, x_label, y_label, logarithmic)
+        return cls(largest(np.subtract(measured, expected)), curve)
 
 
 @dataclass(frozen=True)

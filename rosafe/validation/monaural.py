@@ -254,8 +254,7 @@ def modulation_filter(process: Process) -> Measured:
     edges = np.tan(pi * centre * (np.sqrt(1.25) + np.array([-0.5, 0.5])) / rate)
     warped = np.tan(pi * frequencies / rate)
     expected = -10 * np.log10(1 + ((warped**2 - edges.prod()) / (warped * (edges[1] - edges[0]))) ** 2)
-    curve = Curve(frequencies, expected, measured, "modulation frequency (Hz)", "gain (dB)", True)
-    return Measured(largest(np.array(measured) - expected), curve)
+    return Measured.of(frequencies, expected, measured, "modulation frequency (Hz)", "gain (dB)", True)
 
 
 @ROWS.add(
@@ -362,8 +361,8 @@ def gabor_filters(process: Process) -> Measured:
     outgoing = np.abs(result["gabor"][0][places, last] @ basis)
     measured = 20 * np.log10(outgoing[:, 1] / outgoing[:, 0] / (incoming[1] / incoming[0]))
     expected = np.array([_temporal_ratio(omega, 2 * pi * step * modulations) for omega in omegas])
-    curve = Curve(omegas / (2 * pi * step), expected, measured, "temporal filter (Hz)", "12 Hz over 5 Hz (dB)")
-    return Measured(largest(measured - expected), curve)
+    filters = omegas / (2 * pi * step)
+    return Measured.of(filters, expected, measured, "temporal filter (Hz)", "12 Hz over 5 Hz (dB)")
 
 
 CHANNELS = 23

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -22,6 +23,13 @@ def decorrelation(ours: FloatArray, theirs: FloatArray) -> float:
     return max(1 - float(np.corrcoef(*pair)[0, 1]) for pair in zip(ours, theirs, strict=True))
 
 
+def channels(process: Process, signal: FloatArray, centres: Iterable[float], bandwidth: float) -> FloatArray:
+    """Return the output (C, N) of the filters at these centre frequencies (Hz), with a bandwidth in ERB."""
+    parameters = {"fb_cfHz": [float(one) for one in centres], "fb_bwERBs": bandwidth}
+    output: FloatArray = process(both(signal), RATE, parameters, ["gammatone"])["gammatone"]
+    return output[0]
+
+
 @ROWS.add(
     "gammatone",
     "noise, channels from 100 Hz to 8 kHz",
@@ -36,8 +44,7 @@ def slaney_filters(process: Process) -> float:
     filters = importlib.import_module("gammatone.filters")
     centres, signal = np.geomspace(100, 8000, 12), noise(round(SECONDS * RATE))
     theirs = filters.erb_filterbank(signal, filters.make_erb_filters(RATE, centres))
-    parameters = {"fb_cfHz": list(centres), "fb_bwERBs": 1.019}
-    return decorrelation(process(both(signal), RATE, parameters, ["gammatone"])["gammatone"][0], theirs)
+    return decorrelation(channels(process, signal, centres, 1.019), theirs)
 
 
 @ROWS.add(
@@ -55,8 +62,7 @@ def hohmann_filters(process: Process) -> float:
     signal = noise(round(SECONDS * RATE))
     bank = pyfar.dsp.filter.GammatoneBands([100, 8000], sampling_rate=RATE)
     real, _ = bank.process(pyfar.Signal(signal, RATE))
-    parameters = {"fb_cfHz": [float(one) for one in bank.frequencies], "fb_bwERBs": 1.0186}
-    ours = process(both(signal), RATE, parameters, ["gammatone"])["gammatone"][0]
+    ours = channels(process, signal, bank.frequencies, 1.0186)
     return decorrelation(ours, real.time.reshape(ours.shape))
 
 
@@ -143,6 +149,4 @@ def toolbox_filters(process: Process) -> float:
     auditory_toolbox = importlib.import_module("python_auditory_toolbox.auditory_toolbox")
     signal = noise(round(SECONDS * RATE))
     theirs = auditory_toolbox.ErbFilterBank(signal, auditory_toolbox.MakeErbFilters(RATE, 10, 100))
-    centres = auditory_toolbox.ErbSpace(100, RATE / 2, 10)
-    parameters = {"fb_cfHz": [float(one) for one in centres], "fb_bwERBs": 1.019}
-    return decorrelation(process(both(signal), RATE, parameters, ["gammatone"])["gammatone"][0], theirs)
+    return decorrelation(channels(process, signal, auditory_toolbox.ErbSpace(100, RATE / 2, 10), 1.019), theirs)

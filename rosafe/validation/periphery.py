@@ -78,9 +78,7 @@ def dc_removal(process: Process) -> Measured:
     output = process(both(impulse(16000)), rate, parameters, ["preProc"])["preProc"][0]
     ratio = np.tan(pi * cutoff / rate) / np.tan(pi * frequencies / rate)
     expected, measured = -10 * np.log10(1 + ratio**8), gain_db(output, frequencies, rate)
-    return Measured(
-        largest(measured - expected), Curve(frequencies, expected, measured, "frequency (Hz)", "gain (dB)", True)
-    )
+    return Measured.of(frequencies, expected, measured, "frequency (Hz)", "gain (dB)", True)
 
 
 @ROWS.add(
@@ -160,9 +158,7 @@ def middle_ear(process: Process) -> Measured:
     velocity = np.array(list(STAPES.values())) * 1e-6 * 2 * pi * frequencies / (20e-6 * 10 ** (104 / 20))
     expected = 20 * np.log10(velocity * sqrt(2))  # convention of the front-end: per amplitude, input in 20 µPa
     measured = gain_db(output, frequencies, rate)
-    return Measured(
-        largest(measured - expected), Curve(frequencies, expected, measured, "frequency (Hz)", "gain (dB)", True)
-    )
+    return Measured.of(frequencies, expected, measured, "frequency (Hz)", "gain (dB)", True)
 
 
 # --- filterbanks -------------------------------------------------------------------------------------------------
@@ -180,10 +176,7 @@ def erb_spacing(process: Process) -> Measured:
     frequencies = process(np.zeros((2, 10)), 44100, {"fb_nERBs": 1.0}, ["gammatone"])["fb_cfHz"]
     numbers = 21.4 * np.log10(4.37 * frequencies / 1000 + 1)
     spacing = np.diff(numbers)
-    return Measured(
-        largest(spacing - 1),
-        Curve(frequencies[1:], np.ones(len(spacing)), spacing, "centre frequency (Hz)", "spacing (ERB)", True),
-    )
+    return Measured.of(frequencies[1:], np.ones(len(spacing)), spacing, "centre frequency (Hz)", "spacing (ERB)", True)
 
 
 @ROWS.add(
@@ -299,10 +292,7 @@ def drnl_growth(process: Process) -> Measured:
         output = process(signal, rate, {"fb_type": "drnl", "fb_cfHz": [frequency]}, ["gammatone"])["gammatone"]
         measured.append(20 * np.log10(abs(fundamental(output[0, 0], frequency, rate))))
     expected = drnl_output(velocities, frequency, rate)
-    return Measured(
-        largest(np.array(measured) - expected),
-        Curve(20 * np.log10(velocities), expected, measured, "input (dB re 1 m/s)", "output (dB)"),
-    )
+    return Measured.of(20 * np.log10(velocities), expected, measured, "input (dB re 1 m/s)", "output (dB)")
 
 
 # --- hair cells --------------------------------------------------------------------------------------------------
@@ -326,9 +316,7 @@ def lowpass_row(process: Process, method: str, order: int) -> Measured:
     measured = hair_cell_gain(process, method, frequencies, rate)
     ratio = np.tan(pi * frequencies / rate) / np.tan(pi * 1000 / rate)
     expected = -10 * np.log10(1 + ratio ** (2 * order))
-    return Measured(
-        largest(measured - expected), Curve(frequencies, expected, measured, "frequency (Hz)", "gain (dB)", True)
-    )
+    return Measured.of(frequencies, expected, measured, "frequency (Hz)", "gain (dB)", True)
 
 
 def other_cutoff(factor: float) -> Disturbance:
@@ -388,8 +376,7 @@ def bernstein_growth(process: Process) -> Measured:
         output = process(both(tone(4000, 32000, 0.1, 10 ** (level / 20))), 32000, parameters, ["ihc"])["ihc"][0, 0]
         outputs.append(20 * np.log10(np.mean(output[-800:])))
     measured = np.array(outputs) - outputs[-1]
-    expected = 2 * 0.23 * levels
-    return Measured(largest(measured - expected), Curve(levels, expected, measured, "input (dB)", "output (dB)"))
+    return Measured.of(levels, 2 * 0.23 * levels, measured, "input (dB)", "output (dB)")
 
 
 @ROWS.add(
@@ -445,7 +432,7 @@ def adapted(process: Process, seconds: float, limit: float) -> np.ndarray:
 def adapted_growth(process: Process) -> Measured:
     measured = adapted(process, 8.0, 0.0)[:, 1]
     expected = model_units(10 ** ((LEVELS - 100) / 20 / 32))
-    return Measured(largest(measured - expected), Curve(LEVELS, expected, measured, "level (dB SPL)", "output (MU)"))
+    return Measured.of(LEVELS, expected, measured, "level (dB SPL)", "output (MU)")
 
 
 @ROWS.add(
@@ -500,8 +487,7 @@ def efferent_attenuation(process: Process) -> Measured:
         levels.append(20 * np.log10(result["ratemap"][0, 0, -1]))
         measured.append(result["moc"][0, 0, -1])
     expected = [_cubic(min(max(level, -180.0), -93.821837)) for level in levels]
-    curve = Curve(levels, expected, measured, "20 log10 of the ratemap (dB)", "attenuation (dB)")
-    return Measured(largest(np.subtract(measured, expected)), curve)
+    return Measured.of(levels, expected, measured, "20 log10 of the ratemap (dB)", "attenuation (dB)")
 
 
 def _cubic(level: float) -> float:
