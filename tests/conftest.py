@@ -135,7 +135,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Select how programs start, before the fixtures of the test are created."""
-    harness.forks = item.path.relative_to(harness.ROOT).parts[1] not in OF_THE_START
+    of_the_start = item.path.relative_to(harness.ROOT).parts[1] in OF_THE_START
+    harness.forks = not of_the_start or item.get_closest_marker("forks") is not None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -21,6 +21,7 @@ from tests.harness import END_SECONDS, SCRIPTS, Graph, MasterProcess, Process, f
 from tests.packaging.clone import fresh_copy, without_rights
 
 PROGRAMS = pytest.mark.parametrize("program", ["rosAFE-ros", "bass-ros"])
+FORKS = pytest.mark.forks  # the start of the process does not matter
 
 
 @contextmanager
@@ -71,6 +72,7 @@ def test_wrong_option(graph: Graph, program: str, arguments: list[str]) -> None:
     assert f"{program} -h" in done.stderr
 
 
+@FORKS
 @pytest.mark.parametrize("name", ["", "1left", "left ear", "a/b", "/left", "höhe", "a-b", "~x", "x" * 300 + "!"])
 def test_wrong_instance_name(graph: Graph, name: str) -> None:
     for arguments in (["-i", name], [f"__name:={name}"]):
@@ -158,6 +160,7 @@ def test_a_web_server_at_the_masters_port(masterless: dict[str, Process]) -> Non
     assert "not a ROS master" in error_line(masterless["web"])
 
 
+@FORKS
 @pytest.mark.parametrize(
     "uri", ["nonsense", "http://127.0.0.1", "http://127.0.0.1:99999", "ftp://127.0.0.1:1", "http://[::1"]
 )
@@ -200,6 +203,7 @@ def test_waiting_for_a_silent_master_can_be_interrupted(graph: Graph) -> None:
 # --- an unreachable address --------------------------------------------------------------------------------------
 
 
+@FORKS
 @PROGRAMS
 @pytest.mark.parametrize(
     ("ip", "hostname", "remapping", "why"),
@@ -239,6 +243,7 @@ def test_a_signal_ends_a_node_cleanly(graph: Graph, program: str, number: int) -
         assert "Traceback" not in node.err
 
 
+@FORKS
 @PROGRAMS
 def test_a_kill_request_ends_a_node(graph: Graph, program: str) -> None:
     name = program.removesuffix("-ros")
@@ -248,6 +253,7 @@ def test_a_kill_request_ends_a_node(graph: Graph, program: str) -> None:
         assert f"/{name}" not in graph.nodes()
 
 
+@FORKS
 def test_rosnode_kill_ends_a_node(graph: Graph) -> None:
     with graph.node("bass-ros") as node:
         graph.run("rosnode", "kill", "/bass")
@@ -294,6 +300,7 @@ def test_stdout_is_for_the_output_of_requests(graph: Graph) -> None:
 # --- names ------------------------------------------------------------------------------------------------------
 
 
+@FORKS
 @pytest.mark.parametrize(
     ("arguments", "name"),
     [
@@ -312,12 +319,14 @@ def test_instance(graph: Graph, arguments: list[str], name: str) -> None:
         assert node.stop() == 0
 
 
+@FORKS
 def test_two_instances(graph: Graph) -> None:
     with graph.node("bass-ros", "-i", "left") as left, graph.node("bass-ros", "-i", "right") as right:
         assert left.stop() == 0
         assert right.alive and "/right/Acquire" in graph.services()
 
 
+@FORKS
 def test_a_second_node_of_the_same_name_takes_over(graph: Graph) -> None:
     with graph.node("bass-ros") as old, graph.start("bass-ros") as new:
         assert old.wait() == 0
