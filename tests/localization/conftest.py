@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 from rosafe.localization import training
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.head import Head
-from tests import harness
+from tests import harness, models
 
 RATE = 16000
 KEMAR = Path("/usr/share/libmysofa/MIT_KEMAR_normal_pinna.sofa")
@@ -21,26 +20,26 @@ KEMAR = Path("/usr/share/libmysofa/MIT_KEMAR_normal_pinna.sofa")
 @pytest.fixture(scope="session")
 def sphere_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the file of a model of the sphere, learned from less sound than usual."""
-    return _learned_once(tmp_path_factory, "sphere.head", 250.0, Head.sphere)
+    path = tmp_path_factory.mktemp("model") / "sphere.head"
+    models.learn(tmp_path_factory, RATE).save(path)
+    return path
 
 
 @pytest.fixture(scope="session")
 def kemar_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the file of a model of the MIT KEMAR head, learned from less sound than usual."""
+    """Return the file of a model of the MIT KEMAR head, learned from less sound than usual.
+
+    The first process of a run of the tests that needs it learns it.
+    """
     if not KEMAR.exists():
         pytest.skip("Debian's libmysofa1 is not installed")
-    return _learned_once(tmp_path_factory, "kemar.head", 400.0, lambda: Head.from_sofa(KEMAR))
-
-
-def _learned_once(factory: pytest.TempPathFactory, name: str, seconds: float, head: Callable[[], Head]) -> Path:
-    """Return the file of a model; the first process of a run of the tests that needs it learns it."""
-    path = harness.folder_of_run(factory) / name
+    path = harness.folder_of_run(tmp_path_factory) / "kemar.head"
     with open(path.with_suffix(".lock"), "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not path.exists():
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(training, "SOUND_SECONDS", seconds)
-                training.learn_head(head(), RATE).save(path)
+                patch.setattr(training, "SOUND_SECONDS", 400.0)
+                training.learn_head(Head.from_sofa(KEMAR), RATE).save(path)
     return path
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import rosafe
+from tests import models
 from tests.harness import PYTHON, ROOT, SCRIPTS
 
 TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text("utf-8")
@@ -43,6 +44,18 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", TUTORIAL, re.MULTILINE | re.DOTALL)
 
 
+@pytest.fixture(autouse=True)
+def _models(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Use models of the head that are learned from less sound than usual."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(models.cache(tmp_path_factory)))
+
+
+@pytest.fixture
+def sphere(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Learn the model for the sample rate of tutorial and examples."""
+    models.learn(tmp_path_factory, 16000)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the sound of the tutorial."""
@@ -55,6 +68,7 @@ def is_picture(path: Path) -> bool:
     return path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 20_000
 
 
+@pytest.mark.usefixtures("sphere")
 def test_the_tutorial(folder: Path) -> None:
     pytest.importorskip("xarray", reason="xarray is not here: scripts/install --tests brings it")
     (plot,) = blocks("sh")[1:]
@@ -80,6 +94,7 @@ SAID = {
 }
 
 
+@pytest.mark.usefixtures("sphere")
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.py")))
 def test_an_example(name: str, folder: Path, tmp_path: Path) -> None:
     if name == "features.py":
@@ -93,6 +108,7 @@ def test_an_example(name: str, folder: Path, tmp_path: Path) -> None:
     assert f"`{name}`" in TUTORIAL
 
 
+@pytest.mark.usefixtures("sphere")
 def test_the_notebook(tmp_path: Path) -> None:
     """The notebook runs, and contains no outputs."""
     cells = json.loads((EXAMPLES / "two_ears.ipynb").read_text("utf-8"))["cells"]
