@@ -718,7 +718,7 @@ MUTATIONS = (
     _localizer_node(
         "localizer-processors-left-behind",
         "tree_link.py",
-        "            try:\n                await tree_builder.remove(client, self._created)\n",
+        "            try:\n                await self._created.remove(graph, client)\n",
         "            try:\n                pass\n",
         "tests/localizer_node/test_recovery.py -k own_processors",
     ),

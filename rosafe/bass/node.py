@@ -101,7 +101,8 @@ class BassNode:
             return
         frames: tuple[str, ...] = ("world", "head")
         with contextlib.suppress(*master.FAILURES):  # without a master, the defaults
-            frames = tuple(str(rospy.get_param(f"~{name}_frame", name)) for name in frames)
+            # tf2 has no leading slash
+            frames = tuple(str(rospy.get_param(f"~{name}_frame", name)).strip("/") or name for name in frames)
         publisher = TruthPublisher(cast(TruthSource, source), self._truth, self._truth_class, frames)
         publisher.start()
         try:

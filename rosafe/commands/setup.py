@@ -132,10 +132,12 @@ async def load(setup: Setup, instance: str, wait: float = 0.0) -> dict[str, Any]
 
 
 async def _captured(options: argparse.Namespace) -> str:
-    from rosafe.client import setup_transaction
+    from rosafe.client import localizer, setup_transaction
 
     async with component(options.instance, options.wait) as client:
         try:
+            if await localizer.is_registered(client.graph):
+                print("the localizer is not saved; add a section localizer (docs/setups.md)", file=sys.stderr)
             return write(await setup_transaction.capture(client), options.full)
         except ComponentError as problem:
             raise CommandError(format_error(problem)) from None

@@ -174,13 +174,14 @@ def _whole_trees(kinds: Kinds) -> tuple[Service, ...]:
     )
     save = Service(
         "saveSetup",
-        "The tree of processors and its sound, as the text of a setup file for loadSetup",
+        "The tree of processors and its sound, as the text of a setup file for loadSetup; without the localizer",
         (Parameter("full", "boolean", False, "Flag to include parameters that have their default values"),),
         outputs=(("setup", "string"),),
     )
     load = Service(
         "loadSetup",
-        "Build the tree that a setup describes, in addition to existing processors: completely, or without any change",
+        "Build the tree that a setup describes, in addition to existing processors: completely, or without any change. "
+        "The section localizer is for `rosafe up` and `rosafe setup load`",
         (Parameter("setup", "string", REQUIRED, "The text of a setup (YAML)", longest=MAX_SETUP),),
         outputs=(("created", "sequence<string>"), ("reused", "sequence<string>"), ("sound", "string")),
         throws=_INPUT_THROWS,

@@ -51,7 +51,7 @@ class DirectionTopics:
         from bass.msg import SceneTruth
 
         self._audio, self._append = audio, append
-        self._world_frame = str(rospy.get_param(f"/{bass}/world_frame", "world"))
+        self._world_frame = str(rospy.get_param(f"/{bass}/world_frame", "world")).strip("/") or "world"
         self._lock = threading.Lock()
         self._next = 0  # number of the next column
         self._sources: Any = None

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
-import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -127,17 +127,22 @@ class LocalizationLoop:
             self._arrived.wait(max(0.0, due - time.monotonic()))
             self._arrived.clear()
             with self._lock:
-                try:
-                    used = self._use_new_frames()
-                except Exception:  # messages continue, and the fault is in the log
-                    rospy.logerr_once(traceback.format_exc())
-                    self._begin_again()
-                    used = False
+                used = self._attempt(self._use_new_frames)
                 now = time.monotonic()
                 if used or now >= due:
-                    self._check_silence(now)
-                    self._publish(now)
                     due = now + PERIOD + (SLACK if used else 0.0)
+                    if self._attempt(self._publish) and used:
+                        self._status.clear("localization")
+
+    def _attempt(self, step: Callable[[], bool]) -> bool:
+        """Return the result of a step. After an unexpected error, False: localization begins again."""
+        try:
+            return step()
+        except Exception as problem:  # messages continue
+            self._status.set_error("localization", problem)
+        with contextlib.suppress(Exception):  # the first error is reported
+            self._begin_again()
+        return False
 
     def _use_new_frames(self) -> bool:
         """Localize with the frames that have arrived, if they are enough for an update; return whether they were."""
@@ -166,7 +171,13 @@ class LocalizationLoop:
             return False
         middles = np.maximum.accumulate(middles)
         yaw = np.stack((middles, used.yaw), axis=1) if used.yaw.any() else 0.0
-        result = localizer.update(used.frames.features, middles, yaw, last_only=True)
+        try:
+            result = localizer.update(used.frames.features, middles, yaw, last_only=True)
+        except ValueError as problem:  # not finite
+            self._status.set("values", WARN, f"messages of rosAFE cannot be used: {problem}")
+            self._begin_again()
+            return False
+        self._status.clear("values")
         steady = ", ".join(f"{azimuth:.0f}" for azimuth in localizer.noise.azimuths)
         self._status.value("directions of steady noise (degrees)", steady or "none")
         self._estimate = result["azimuths"], result["posterior"][0]
@@ -181,8 +192,9 @@ class LocalizationLoop:
                 self._begin_again()
         self._queue.append(new)
 
-    def _check_silence(self, now: float) -> None:
+    def _check_silence(self) -> None:
         """Forget the sources if no frames were used for too long."""
+        now = time.monotonic()
         source = self._source
         if source is None:
             return
@@ -194,9 +206,12 @@ class LocalizationLoop:
         elif not source.problem:
             self._status.set("frames", WARN, "waiting for sound: no new frames from rosAFE")
 
-    def _publish(self, now: float) -> None:
+    def _publish(self) -> bool:
+        """Publish the state; return True."""
+        self._check_silence()
         localizer = self._localizer
         sources = localizer.sources if localizer is not None and self._newest and not self._queue.muted else []
         gain_db = localizer.model.level_gain_db if localizer is not None else 0.0
         stamp = self._newest or rospy.get_time()
         self._publishers.publish(stamp, sources, gain_db, self._estimate)
+        return True

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import threading
+import traceback
 from collections.abc import Callable
 from typing import Any
 
 import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
+
+from rosafe.terminal import printable
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -27,6 +30,7 @@ class NodeStatus:
         self._causes: dict[str, tuple[int, str]] = {}  # by part of the node
         self._values: dict[str, str] = {}
         self._logged = ""
+        self._errors: set[tuple[type, str]] = set()  # unexpected ones that are in the log: class and place
 
     def set(self, part: str, level: int, text: str, log: bool = True) -> None:
         """Set the state of a part of the node; a new text of the whole node is logged once."""
@@ -39,8 +43,19 @@ class NodeStatus:
                 self._logged = text
         if new:
             if log:
-                (rospy.loginfo if level == OK else rospy.logwarn)(text)
+                {OK: rospy.loginfo, WARN: rospy.logwarn, ERROR: rospy.logerr}[level](text)
             self._changed()
+
+    def set_error(self, part: str, problem: Exception) -> None:
+        """Report an unexpected error of a part that continues; the log has its traceback once."""
+        place = str(traceback.extract_tb(problem.__traceback__)[-1:])
+        new = (type(problem), place) not in self._errors
+        self._errors.add((type(problem), place))
+        if new:
+            rospy.logerr("".join(traceback.format_exception(problem)))
+        self.count("unexpected errors", 1)
+        text = f"unexpected error, the node tries again: {type(problem).__name__}: {printable(str(problem))}"
+        self.set(part, ERROR, text, log=new)
 
     def clear(self, part: str) -> None:
         """Remove the state of a part."""

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ from rosafe.client.tcpros import ServiceClient, component_exception
 from rosafe.interface import BLOCK_AND_BUFFERS, REQUEST, ROSAFE, ComponentError, format_value
 from rosafe.localization import cues
 from rosafe.localization.direction_model import DirectionModel
+from rosafe.localizer_node.created_processors import CreatedProcessors
 from rosafe.localizer_node.frame_source import FrameFormat
 from rosafe.localizer_node.sound_probe import sound_rate
 from rosafe.localizer_node.status import OK, WARN, NodeStatus
@@ -30,12 +31,13 @@ from rosafe.transport import registration
 from rosafe.tree import tree_builder
 from rosafe.tree.tree_planner import ExistingProcessor
 
-BLOCK_SECONDS = 0.05  # block of a new input: 2205 frames at 44.1 kHz, a multiple of the hop
+BLOCK_SECONDS = 0.05  # block of a new input, rounded to a multiple of the hop: 2205 frames at 44.1 kHz
 POLL_SECONDS = 1.0  # between two checks of the processors, and between two attempts
 SOUND_SECONDS = 1.0  # for two messages of the sound
 CALL_SECONDS = 30.0
 MAX_PAUSE = 16.0  # s between two requests that fail
 REMOVE_SECONDS = 2.0  # for the processors to be removed at the end
+STOPPED = "rosAFE was stopped: waiting for an input (InputProc, rosafe request, or a setup), or a restart of rosAFE"
 
 
 @dataclass(frozen=True)
@@ -94,9 +96,8 @@ class TreeLink:
         self._model_for = model_for
         self._established, self._is_stalled = established, is_stalled
         self._status = status
-        self._created: list[str] = []  # processors, without the input
-        self._node = ""  # the address of the rosAFE that has them
-        self._memory = rospy.resolve_name("~created")  # parameter by which a successor of this node knows them
+        self._created = CreatedProcessors()
+        self._input_of = ""  # the address of the rosAFE whose input was there
         self._watched: dict[str, ExistingProcessor] = {}
         self._rate = 0.0  # sample rate, Hz
         self._wakener: tuple[asyncio.AbstractEventLoop, asyncio.Event] | None = None
@@ -130,14 +131,15 @@ class TreeLink:
             while not self._closing:
                 try:
                     await self._serve(graph)
-                except (_Waiting, ComponentError) as problem:
-                    pause = (
-                        POLL_SECONDS if self._watched or isinstance(problem, _Waiting) else min(2 * pause, MAX_PAUSE)
-                    )
-                    if self._watched:
-                        self._watched = {}
-                        self._established(None)
+                except _Waiting as problem:
+                    pause = POLL_SECONDS
+                    self._status.set("rosAFE", WARN, printable(str(problem)))
+                except ComponentError as problem:
+                    pause = min(2 * pause, MAX_PAUSE)
                     self._status.set("rosAFE", WARN, _reason(problem))
+                except Exception as problem:  # the node continues, and waits until rosAFE can be used again
+                    pause = min(2 * pause, MAX_PAUSE)
+                    self._status.set_error("rosAFE", problem)
                 await self._pause(pause)
             with contextlib.suppress(ComponentError, NotRegisteredError, TimeoutError):
                 await asyncio.wait_for(self._remove_created(graph), REMOVE_SECONDS)
@@ -145,13 +147,12 @@ class TreeLink:
             await graph.close()
 
     async def _remove_created(self, graph: Graph) -> None:
-        if self._created and not registration.registrar().is_replaced:  # its successor uses them, and removes them
+        if self._created.names and not registration.registrar().is_replaced:  # otherwise its successor uses them
             client = await ComponentClient.load(graph, self._instance)
             try:
-                await tree_builder.remove(client, self._created)
+                await self._created.remove(graph, client)
             finally:
                 await client.close()
-            await graph.master("deleteParam", self._memory)
 
     async def _pause(self, seconds: float = POLL_SECONDS) -> None:
         assert self._wakener is not None
@@ -168,7 +169,7 @@ class TreeLink:
         except ComponentError as problem:
             raise _Waiting(f"waiting for rosAFE: {problem.what}") from None
         try:
-            await self._recall_created(graph)
+            await self._recall_created(graph, client)
             link = await self._establish(graph, client)
             self._status.set("rosAFE", OK, f"localizing with {', '.join(link.topics.values())}")
             self._established(link)
@@ -177,27 +178,30 @@ class TreeLink:
                 await self._check(client)
         except TimeoutError:
             raise _Waiting(f"waiting for rosAFE: /{self._instance} does not answer") from None
+        except ComponentError as problem:
+            if self._watched:  # rosAFE has ended
+                raise _Waiting(_reason(problem)) from None
+            raise
         finally:
+            if self._watched:
+                self._watched = {}
+                self._established(None)
             await client.close()
 
-    async def _recall_created(self, graph: Graph) -> None:
+    async def _recall_created(self, graph: Graph, client: ComponentClient) -> None:
         """Find out which processors of this rosAFE were created by this node, or by one of its name before it."""
         try:
             node = await graph.node_uri(self._instance)
         except NotRegisteredError:  # it ends, or the master has restarted
             raise _Waiting(f"waiting for rosAFE: /{self._instance} is not registered at the master") from None
-        if node != self._node:
-            self._node, self._created = node, []
-            with contextlib.suppress(NotRegisteredError):
-                kept = await graph.master("getParam", self._memory)
-                if isinstance(kept, list) and kept[:1] == [node]:
-                    self._created = [str(name) for name in kept[1:]]
+        await self._created.recall(graph, node)
+        await self._created.keep(graph, (p.name for p in await tree_builder.list_processors(client)))
 
     async def _establish(self, graph: Graph, client: ComponentClient) -> Link:
         service = ServiceClient(graph, ROSAFE.name, self._instance, "request")
         try:
-            rate = await self._sample_rate(graph, service, client)
-            model = await self._model(rate)
+            model = await self._model_of_input(graph, service, client)
+            rate = model.sample_rate
             topics: dict[str, str] = {}
             names: set[str] = set()
             for kind in cues.KINDS:
@@ -208,50 +212,48 @@ class TreeLink:
             service.close()
         processors = {p.name: p for p in await tree_builder.list_processors(client)}
         missing = names - processors.keys()
-        root = next((processors[name] for name in names & processors.keys() if not processors[name].parent), None)
-        if missing or root is None or root.rate != rate:
+        root = _input_of(processors.values())
+        if missing or root is None or root.name not in names or root.rate != rate:
             raise _Waiting("the processors of rosAFE have changed meanwhile")
         self._watched, self._rate = {name: processors[name] for name in names}, rate
+        self._input_of = self._created.node
         block = int(root.values["nFramesPerBlock"])
-        window, hop = (round(model.parameters[f"cc_{name}"] * rate) for name in ("wSizeSec", "hSizeSec"))
-        self._report_block(block, hop, rate)
+        window, hop = _samples(model, "wSizeSec"), _samples(model, "hSizeSec")
+        _report_block(self._status, block, hop, rate)
         return Link(model, FrameFormat(rate, model.channels, window, hop, block), topics)
 
-    def _report_block(self, block: int, hop: int, rate: float) -> None:
-        self._status.value("block of rosAFE (frames)", block)
-        more = 1000 * (block / rate - BLOCK_SECONDS)
-        if more > 1:
-            rospy.logwarn(f"the input of rosAFE has blocks of {block} frames: they add {more:.0f} ms to the latency")
-        if block % hop:
-            rospy.logwarn(
-                f"the blocks of rosAFE ({block} frames) are not a multiple of the hop ({hop}): the frames of "
-                "processors that were created one after another do not coincide, and sources are found less often"
-            )
-
-    async def _sample_rate(self, graph: Graph, service: ServiceClient, client: ComponentClient) -> float:
-        """Return the sample rate of the input, which is created if there is none, or if that of the sound differs."""
+    async def _model_of_input(self, graph: Graph, service: ServiceClient, client: ComponentClient) -> DirectionModel:
+        """Return the model for the input, which is created if there is none, or if the rate of the sound differs."""
         for _ in range(2):
-            processors = await tree_builder.list_processors(client)
-            root = next((processor for processor in processors if not processor.parent), None)
+            root = _input_of(await tree_builder.list_processors(client))
             if root is None:
-                while not (rate := await self._sound_rate(client)):
-                    if self._closing or not await client.is_reachable():
-                        raise _Waiting("waiting for rosAFE")
-                await self._request(graph, service, "input", {"nFramesPerBlock": round(rate * BLOCK_SECONDS)})
+                model = await self._model(await self._wait_for_sound(client))
+                hop = _samples(model, "hSizeSec")
+                frames = hop * max(1, round(BLOCK_SECONDS * model.sample_rate / hop))
+                await self._request(graph, service, "input", {"nFramesPerBlock": frames})
             elif (await self._sound_rate(client) or root.rate) != root.rate:
-                await self._replace_input(client, root)
+                await self._replace_input(graph, client, root)
             else:
-                return root.rate
+                return await self._model(root.rate)
         raise _Waiting("waiting for rosAFE: its input has changed")
 
-    async def _replace_input(self, client: ComponentClient, root: ExistingProcessor) -> None:
+    async def _wait_for_sound(self, client: ComponentClient) -> int:
+        """Return the sample rate of the sound, for an input that is to be created."""
+        if self._input_of == self._created.node:
+            raise _Waiting(STOPPED)
+        while not (rate := await self._sound_rate(client)):
+            if self._closing or not await client.is_reachable():
+                raise _Waiting("waiting for rosAFE")
+        return rate
+
+    async def _replace_input(self, graph: Graph, client: ComponentClient, root: ExistingProcessor) -> None:
         """Create the input again, for sound of another sample rate. Only processors of this node are removed."""
-        await tree_builder.remove(client, self._created)
-        self._created = []
+        await self._created.remove(graph, client)
         buffers = {parameter.name: root.values[parameter.name] for parameter in BLOCK_AND_BUFFERS}
         try:
             await client.outputs("InputProc", {"name": root.name, **buffers})
         except ComponentError as problem:
+            self._input_of = ""  # after Stop an input is created
             raise _Waiting(
                 f"waiting for rosAFE: {problem.what}: rosservice call /{self._instance}/Stop removes its processors"
             ) from None
@@ -287,8 +289,7 @@ class TreeLink:
             raise problem
         created = [name for name in answer.created if name != answer.dependencies[0]]
         if created:
-            self._created += created
-            await graph.master("setParam", self._memory, [self._node, *self._created])
+            await self._created.add(graph, created)
         return answer
 
     async def _check(self, client: ComponentClient) -> None:
@@ -300,6 +301,8 @@ class TreeLink:
             if rate and rate != self._rate:
                 raise _Waiting(f"the sample rate of the sound has changed from {self._rate:g} to {rate} Hz")
         found = {p.name: p for p in await tree_builder.list_processors(client)}
+        if _input_of(found.values()) is None:
+            raise _Waiting(STOPPED)
         for name, expected in self._watched.items():
             if name not in found:
                 raise _Waiting(f"the processor {name} of rosAFE was removed; it is requested again")
@@ -309,8 +312,27 @@ class TreeLink:
                 raise _Waiting(f"{what} of the processor {name} of rosAFE was changed; another one is requested")
 
 
-def _reason(problem: Exception) -> str:
-    if isinstance(problem, ComponentError):
-        what = problem.what or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
-        return printable(f"waiting for rosAFE: {problem.ex}: {what}")
-    return printable(str(problem))
+def _input_of(processors: Iterable[ExistingProcessor]) -> ExistingProcessor | None:
+    return next((processor for processor in processors if not processor.parent), None)
+
+
+def _samples(model: DirectionModel, name: str) -> int:
+    """Return the length or distance of frames in samples."""
+    return round(model.parameters[f"cc_{name}"] * model.sample_rate)
+
+
+def _report_block(status: NodeStatus, block: int, hop: int, rate: float) -> None:
+    status.value("block of rosAFE (frames)", block)
+    more = 1000 * (block / rate - BLOCK_SECONDS)
+    if more > 1:
+        rospy.logwarn(f"the input of rosAFE has blocks of {block} frames: they add {more:.0f} ms to the latency")
+    if block % hop:
+        rospy.logwarn(
+            f"the blocks of rosAFE ({block} frames) are not a multiple of the hop ({hop}): the frames of "
+            "processors that were created one after another do not coincide, and sources are found less often"
+        )
+
+
+def _reason(problem: ComponentError) -> str:
+    what = problem.what or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
+    return printable(f"waiting for rosAFE: {problem.ex}: {what}")

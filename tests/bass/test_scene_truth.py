@@ -6,6 +6,8 @@ import importlib
 from pathlib import Path
 
 import numpy as np
+import pytest
+import rospy
 
 from tests.harness import Graph, Process, wait_for
 
@@ -47,6 +49,31 @@ def test_truth_of_a_scene_file(graph: Graph, bass_node: Process, tmp_path: Path)
     assert (transform.header.frame_id, transform.child_frame_id) == ("world", "head")
     rotation = transform.transform.rotation
     assert 0.1 < np.degrees(2 * np.arctan2(rotation.z, rotation.w)) <= 40
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [(("/map", "/robot/head"), ("map", "robot/head")), (("/", "head"), ("world", "head"))],
+)
+def test_names_of_coordinate_frames(
+    graph: Graph, bass_node: Process, names: tuple[str, str], expected: tuple[str, str]
+) -> None:
+    """In tf2 they have no leading slash."""
+    graph.client()
+    transform_class = importlib.import_module("tf2_msgs.msg").TFMessage
+    parameters = dict(zip(("/bass/world_frame", "/bass/head_frame"), names, strict=True))
+    for parameter, name in parameters.items():
+        rospy.set_param(parameter, name)
+    try:
+        with graph.collect("/tf", transform_class) as transforms:
+            graph.call("/bass/Acquire", device="scene:", sampleRate=8000, nFramesPerChunk=400, nChunksOnPort=4)
+            wait_for(lambda: transforms)
+            graph.call("/bass/Stop")
+    finally:
+        for parameter in parameters:
+            rospy.delete_param(parameter)
+    transform = transforms[-1].transforms[0]
+    assert (transform.header.frame_id, transform.child_frame_id) == expected
 
 
 def test_the_built_in_scene_has_a_truth(graph: Graph, bass_node: Process) -> None:

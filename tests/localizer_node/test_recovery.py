@@ -17,6 +17,7 @@ from tests.localization.conftest import RATE, modulated
 from tests.localizer_node.session import (
     acquire,
     names_of,
+    present,
     running_localizer,
     scene_file,
     watched,
@@ -96,9 +97,47 @@ def test_processors_that_are_removed_or_changed(
         assert "fb_highFreqHz" in localizer.process.err
         wait_for(lambda: sum(name.startswith("filterbank") for name in names_of(graph)) == 2)
         localizer.wait_present(40)
-        graph.call("/rosAFE/Stop")
-        localizer.log("was removed; it is requested again")
+
+
+def test_stop_holds_until_there_is_an_input(
+    graph: Graph, afe: Process, empty: None, device: str, sphere_model: Path
+) -> None:
+    acquire(graph, device)
+    with running_localizer(graph, "--head", str(sphere_model)) as localizer, localizer.collect() as messages:
         localizer.wait_present(40)
+        graph.call("/rosAFE/Stop")
+        state = localizer.state(lambda entries: "rosAFE was stopped" in entries["message"])
+        assert state["level"] == "1"
+        count = len(messages)
+        wait_for(lambda: len(messages) > count + 30)
+        assert not names_of(graph) and not present(messages[-1])
+        assert graph.call("/rosAFE/InputProc", name="mine", nFramesPerBlock=800).genom_success
+        localizer.wait_present(40)
+        assert localizer.process.stop() == 0
+    assert names_of(graph) == {"mine"}
+
+
+def test_processors_of_a_replaced_input_are_forgotten(
+    graph: Graph, afe: Process, empty: None, device: str, sphere_model: Path, tmp_path: Path
+) -> None:
+    """Others may create processors with the names of those that the localizer has removed."""
+    acquire(graph, device)
+    (tmp_path / "fast").mkdir()
+    fast = scene_file(tmp_path / "fast", "sample_rate: 22050\nsources:\n  - {signal: noise, azimuth: 40}\n")
+    options = ("--head", str(sphere_model), "--connect", "bass/Audio")
+    with running_localizer(graph, *options) as localizer:
+        localizer.wait_present(40)
+        name = next(name for name in names_of(graph) if name.startswith("ild"))
+        acquire(graph, fast)
+        localizer.state(lambda entries: "for which the model was learned" in entries["message"])
+        (root,) = names_of(graph)
+        assert graph.call("/rosAFE/PreProc", name=name, upperDepName=root).genom_success
+        assert localizer.process.stop() == 0
+    assert names_of(graph) == {root, name}
+    with running_localizer(graph, *options) as localizer:
+        localizer.state(lambda entries: "for which the model was learned" in entries["message"])
+        assert localizer.process.stop() == 0
+    assert names_of(graph) == {root, name}, "the processor of another client"
 
 
 class Talker(threading.Thread):
@@ -203,6 +242,7 @@ def test_restarts_of_bass_and_rosafe(graph: Graph, device: str, sphere_model: Pa
                     localizer.wait_present(40)
                     assert localizer.process.err.count("waiting for sound") == count + 1, "it is logged once"
                     assert localizer.process.stop() == 0
+                assert len(names_of(graph, "hearing")) == 1, "the input cannot be removed"
 
 
 def test_a_master_that_is_away(tmp_path: Path, device: str, sphere_model: Path) -> None:

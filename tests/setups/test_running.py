@@ -71,6 +71,17 @@ def test_the_settings_of_the_localizer_become_its_parameters(graph: Graph, tmp_p
         graph.run("rosparam", "delete", "/localizer")
 
 
+def test_save_names_what_it_leaves_out(graph: Graph, tmp_path: Path) -> None:
+    with graph.node("rosAFE-ros"):
+        assert "localizer" not in graph.run("rosafe", "setup", "save", "-").stderr
+        with graph.start("rosafe", "localize") as localizer:
+            wait_for(lambda: "ready" in localizer.err)
+            saved = graph.run("rosafe", "setup", "save", str(tmp_path / "saved.yaml"))
+            assert "the localizer is not saved; add a section localizer" in saved.stderr
+            assert localizer.stop() == 0
+    assert read((tmp_path / "saved.yaml").read_text()).localizer is None
+
+
 def test_by_http_and_tcl(graph: Graph, file: Path, tmp_path: Path) -> None:
     port = free_port()
     text = file.read_text()
