@@ -6,6 +6,7 @@ Run as a program, it lists the sentences of the paths given: ``python3 -m tests.
 from __future__ import annotations
 
 import ast
+import functools
 import io
 import re
 import sys
@@ -44,6 +45,7 @@ SUFFIXES = {".py", ".md", *_COMMENTS}
 _MIN_WORDS = 4  # a shorter piece of text is a label and not a sentence
 
 
+@functools.cache
 def sentences(path: Path) -> list[str]:
     """Return the sentences of a document, or of the docstrings, comments and messages of a program."""
     return [
