@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -10,7 +11,11 @@ from pathlib import Path
 import pytest
 
 from rosafe import __version__, commands
+from rosafe.commands.__main__ import main
+from rosafe.component import generate
+from rosafe.declarations import plugins
 from rosafe.interface import KINDS
+from rosafe.transport import master
 from tests.cli.command import ROSAFE, environment, refused, rosafe, rosafe_alone
 from tests.harness import PATIENCE, ROOT
 
@@ -133,3 +138,19 @@ def test_without_debians_packages() -> None:
     assert done.returncode == 0 and "Check the installation and report" in done.stdout, done
     for arguments in (["-h"], ["sound.wav"]):
         refused(rosafe_alone("process", *arguments), "rosafe process", "numpy is not installed; run scripts/install")
+
+
+@pytest.mark.parametrize("arguments", [["trace"], ["request", "ild"], ["live"], ["localize", "--check"]])
+def test_messages_that_cannot_be_generated(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail() -> None:
+        raise generate.GenerationError("genpy is not installed")
+
+    monkeypatch.setattr(generate, "ensure_messages", fail)
+    monkeypatch.setattr(master, "check_master", lambda *_: None)
+    monkeypatch.setattr(plugins, "_disabled", False)  # restored, because some commands set it
+    for name in ("ROS_MASTER_URI", "ROS_IP", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.setenv(name, os.environ.get(name, ""))
+    assert main(arguments) == 1
+    assert capsys.readouterr().err == f"rosafe {arguments[0]}: genpy is not installed\n"

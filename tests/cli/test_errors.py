@@ -210,7 +210,7 @@ def test_missing_disk_space_is_reported_before_processing(folder: Path) -> None:
         file.write(head[:4] + (36 + size).to_bytes(4, "little") + head[8:40] + size.to_bytes(4, "little"))
         file.truncate(len(head) + size)
     done = rosafe("process", "in.wav", "--set", "fb_nChannels=1000", cwd=folder)
-    refused(done, "in.wav", "GB are free", "--outputs")
+    refused(done, "in.wav", "B are free; name fewer", "--outputs")
     assert_untouched(folder)
 
 
