@@ -284,7 +284,8 @@ def _with_arrays(component: interface.ComponentSpec, generated: type[Any], membe
             setattr(self, name, value)
         return self
 
-    return type(generated.__name__, (generated,), {"serialize": serialize, "deserialize": deserialize})
+    members_of_class = {"serialize": serialize, "deserialize": deserialize, "accepts_buffers": True}
+    return type(generated.__name__, (generated,), members_of_class)
 
 
 def _generated(package: str, module: str, name: str) -> Any:

@@ -15,6 +15,7 @@ from rosafe.sound.windows import MAX_WINDOW
 from rosafe.transport.log_throttle import ThrottledLog
 from rosafe.tree.tree import Tree
 
+RECEIVE_BYTES = 4096  # that rospy reads at a time; the rest of a message is received without its buffer
 FIRST_AUDIO_SECONDS = 1.0  # that InputProc waits for the first message
 
 
@@ -56,6 +57,7 @@ class AudioInput:
             topic,
             serialization.tolerant_message_class("rosAFE", "::binaudio::portStruct", MAX_WINDOW),
             receive,
+            buff_size=RECEIVE_BYTES,
             queue_size=None,  # no message is dropped: a window can be shorter than a pause of this thread
             tcp_nodelay=True,
         )

@@ -29,6 +29,7 @@ from typing import Any
 
 import genmsg.msgs
 import genpy.message
+import numpy as np
 import rosgraph.xmlrpc
 import rospy
 from rosgraph.network import decode_ros_handshake_header, write_ros_handshake_header
@@ -263,16 +264,46 @@ def read_header(sock: socket.socket, buffer: io.BytesIO, size: int) -> dict[str,
 
 
 def _read_messages(self: Any, buffer: io.BytesIO, messages: list[Any], sock: socket.socket) -> None:
-    """Read complete messages; TransportTerminated if the next one is too long. Replaces rospy's method."""
-    deserialize_messages(buffer, messages, self.recv_data_class, queue_size=self.queue_size)
-    if buffer.tell() < _LENGTH.size:
-        return
+    """Read complete messages; TransportTerminated if the next one is too long. Replaces rospy's method.
+
+    If no message may be dropped, and the class `accepts_buffers`, the rest of a message is received without rospy's
+    buffer, from which it would be copied twice.
+    """
+    data_class = self.recv_data_class
+    direct = self.queue_size is None and getattr(data_class, "accepts_buffers", False)
+    if not direct:
+        deserialize_messages(buffer, messages, data_class, queue_size=self.queue_size)
+        if buffer.tell() < _LENGTH.size:
+            return
     (size,) = _LENGTH.unpack_from(buffer.getbuffer())
-    limit = max_message_size(self.recv_data_class)
+    if buffer.tell() - _LENGTH.size >= size:
+        deserialize_messages(buffer, messages, data_class)
+        return
+    limit = max_message_size(data_class)
     if size > limit:
         problem = f"message: expected at most {limit} bytes, got {size}; the publisher was disconnected"
         _report(self.resolved_name, sock.getpeername()[0], problem)
         raise TransportTerminated(problem)
+    if direct:
+        messages.append(data_class().deserialize(_read_rest(buffer, size, sock)))
+
+
+def _read_rest(buffer: io.BytesIO, size: int, sock: socket.socket) -> memoryview:
+    """Return the message of `size` bytes that begins in `buffer`, which is empty then."""
+    data = memoryview(np.empty(size, np.uint8))
+    at = buffer.tell() - _LENGTH.size
+    data[:at] = buffer.getbuffer()[_LENGTH.size : _LENGTH.size + at]
+    while at < size:
+        try:
+            received = sock.recv_into(data[at:], 0, socket.MSG_WAITALL)
+        except OSError as problem:
+            raise TransportTerminated(str(problem)) from None
+        if not received:
+            raise TransportTerminated("the publisher has disconnected")
+        at += received
+    buffer.seek(0)
+    buffer.truncate()
+    return data.toreadonly()
 
 
 # --- lengths ----------------------------------------------------------------------------------------------------
