@@ -6,6 +6,7 @@ import errno
 import itertools
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -84,43 +85,48 @@ class TaskStatistics:
     """Measurements of one task of the component: number and duration of its cycles, and its load.
 
     The load is the time spent in cycles divided by the elapsed time. It can exceed 1 if a task has several processors.
+
+    Attributes
+    ----------
+    cycle : callable
+        Count a cycle of some seconds. It may be called from any thread, thousands of times per second.
     """
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.cycles = 0
-        self.last = self.longest = self.total = 0.0
         self.load = self.load_max = 0.0
-        self._busy = 0.0
+        self._pending: deque[float] = deque()  # the cycles since the last snapshot, of which there is one per second
+        self.cycle: Callable[[float], None] = self._pending.append
+        self._cycles = 0
+        self._last = self._longest = self._total = self._busy = 0.0
         self._since = self._start = time.monotonic()
         self._lock = threading.Lock()
 
-    def cycle(self, seconds: float) -> None:
-        """Count a cycle of `seconds`."""
-        with self._lock:
-            self.cycles += 1
-            self.last = seconds
-            if seconds > self.longest:
-                self.longest = seconds
-            self.total += seconds
-            self._busy += seconds
+    def _count_pending(self) -> None:
+        for _ in range(len(self._pending)):
+            self._last = self._pending.popleft()
+            self._longest = max(self._longest, self._last)
+            self._total += self._last
+            self._busy += self._last
+            self._cycles += 1
 
     def snapshot(self) -> dict[str, Any]:
         """Return the member `rusage` of genom_state: timings in seconds, and the load of about the last second."""
         with self._lock:
+            self._count_pending()
             now = time.monotonic()
             if now - self._since >= LOAD_SECONDS:
                 self.load = self._busy / (now - self._since)
                 self.load_max = max(self.load_max, self.load)
                 self._busy, self._since = 0.0, now
-            average = self.total / self.cycles if self.cycles else 0.0
+            average = self._total / self._cycles if self._cycles else 0.0
             return {
-                "cycles": self.cycles % 2**32,
-                "timings": {"last": self.last, "max": self.longest, "avg": average},
+                "cycles": self._cycles % 2**32,
+                "timings": {"last": self._last, "max": self._longest, "avg": average},
                 "load": {
                     "last": self.load,
                     "max": self.load_max,
-                    "avg": self.total / max(now - self._start, 1e-9),
+                    "avg": self._total / max(now - self._start, 1e-9),
                 },
             }
 

@@ -57,7 +57,7 @@ class SlowCalls:
 
     def executed(self, processor: Processor, seconds: float) -> None:
         """Register a call that took `seconds`."""
-        if seconds > SLOW_SECONDS and _is_slow(processor, seconds):
+        if _is_slow(processor, seconds):
             self._report(processor, processor.blocks - 1, f"one call took {seconds:.1f} s")
 
     def _report(self, processor: Processor, block: int, duration: str) -> None:
@@ -98,22 +98,24 @@ class ProcessorHealth:
     def __init__(self, tree: Tree, choices: ChoiceFallbacks) -> None:
         self._tree, self._choices = tree, choices
         self._slow = SlowCalls(tree)
-        self._loads: dict[Processor, TaskStatistics] = {}
+        self._meters: dict[Processor, tuple[TaskStatistics, TaskStatistics]] = {}  # its own, and that of its task
 
-    def added(self, processor: Processor) -> None:
-        """Register a processor that is about to start."""
-        self._loads[processor] = TaskStatistics(processor.name)
+    def added(self, processor: Processor, task: TaskStatistics) -> None:
+        """Register a processor that is about to start; its computing time is added to that of `task`."""
+        self._meters[processor] = TaskStatistics(processor.name), task
 
     def executed(self, processor: Processor, seconds: float) -> None:
         """Register the computation of a block, which took `seconds`."""
-        meter = self._loads.get(processor)  # None if it has ended
-        if meter is not None:
-            meter.cycle(seconds)
-            self._slow.executed(processor, seconds)
+        meters = self._meters.get(processor)  # None if it has ended
+        if meters is not None:
+            meters[0].cycle(seconds)
+            meters[1].cycle(seconds)
+            if seconds > SLOW_SECONDS:
+                self._slow.executed(processor, seconds)
 
     def ended(self, processor: Processor) -> None:
         """Register the end of a processor; log the reason of a failure with its traceback."""
-        self._loads.pop(processor, None)
+        self._meters.pop(processor, None)
         self._slow.forget(processor)
         if processor.error is not None:
             failure = next((f for f in self._tree.failures if f.name == processor.name), Failure.of(processor))
@@ -142,8 +144,8 @@ class ProcessorHealth:
             status.add("unknown word", warning)
         status.add("workers", str(self._tree.workers))
         for processor in processors:
-            meter = self._loads.get(processor)
-            load = 1e3 * meter.snapshot()["load"]["last"] if meter is not None else 0.0
+            meters = self._meters.get(processor)
+            load = 1e3 * meters[0].snapshot()["load"]["last"] if meters is not None else 0.0
             state = f"{processor.kind}, {processor.state.value}, {processor.blocks} blocks, {load:.1f} ms/s"
             status.add(processor.name, state)
         return status

@@ -88,12 +88,11 @@ class PublishedTree:
             publisher = self._advertise(processor.kind, processor.name)
             port = OutputPort(processor, publisher, publisher.unregister)
         self._ports[processor] = port
-        self.health.added(processor)
+        self.health.added(processor, self._meters[processor.kind])
         port.publish()
 
     def on_executed(self, processor: Processor, seconds: float) -> None:
         """Add the computing time to genom_state and /diagnostics."""
-        self._meters[processor.kind].cycle(seconds)
         self.health.executed(processor, seconds)
 
     def on_released(self, processor: Processor, block: Block) -> None:
