@@ -58,7 +58,7 @@ class PublishedTree:
         self._newest_time = NewestMessage(self._build_time)
         self._newest_frame = (0, LinearClock(0.0, 0.0, 1.0))  # of `_newest_time`
         self._meters = {kind: node.meters[ROSAFE.service(r.request).task] for kind, r in KINDS.items()}
-        self.tree = Tree(self, workers)
+        self.tree = Tree(self, workers, real_time=True)
         self.health = ProcessorHealth(self.tree, choices)
 
     def run(self, activity: Activity, processor: Processor, save: Callable[[], None]) -> None:

@@ -35,13 +35,15 @@ class Tree:
     workers : int, optional
         Number of threads that compute. By default the value of the environment variable ROSAFE_WORKERS, or the number
         of available cores. Raises ValueError if it is not between 1 and 1024.
+    real_time : bool
+        Whether blocks arrive in real time; see `Workers`.
     """
 
-    def __init__(self, listener: TreeListener, workers: int | None = None) -> None:
+    def __init__(self, listener: TreeListener, workers: int | None = None, real_time: bool = False) -> None:
         self._registry = ProcessorRegistry()
         self._lock = threading.RLock()  # guards all tokens
         self._requests = threading.RLock()  # one request at a time; acquired before _lock
-        self._workers = Workers(self._lock, workers_to_use(workers))
+        self._workers = Workers(self._lock, workers_to_use(workers), real_time)
         self._context = TreeContext(self._workers, listener, self.end, threading.Condition(self._lock))
         self.sample_rate = 0.0
         self.port_seconds = self.history_seconds = 1.0

@@ -26,6 +26,8 @@ VARIABLE = "ROSAFE_WORKERS"
 MAX_WORKERS = 1024
 BLOCKED_TIMEOUT_SECONDS = 0.05
 WAKE_THRESHOLD_SECONDS = 1e-3  # of waiting work: below, two workers lose more by competing for the GIL than they gain
+REAL_TIME_THRESHOLD_SECONDS = 0.02  # the same for sound in real time: two cores need more time in total, and a tree
+# that keeps up delivers results later than with two workers by less than this
 BUSY_THRESHOLD_SECONDS = 2.5e-4  # the same for a busy pool, whose tree may not keep up: its workers were not all idle
 BUSY_SECONDS = 0.1  # within this time
 WORKER = "rosafe worker"  # prefix of the threads' names
@@ -84,11 +86,15 @@ class Workers:
         The tree's lock. All but `join` is called with it held.
     count : int
         The number of workers that may compute at the same time.
+    real_time : bool
+        Whether blocks arrive in real time. As long as the tree keeps up, another worker is then woken for long tasks
+        only.
     """
 
-    def __init__(self, lock: threading.RLock, count: int) -> None:
+    def __init__(self, lock: threading.RLock, count: int, real_time: bool = False) -> None:
         self.lock = lock
         self.count = count
+        self._real_time = real_time
         self._clients = 0
         self._ready: list[tuple[int, int, Task]] = []  # a heap: the deepest first, of these the newest
         self._sequence = itertools.count(0, -1)
@@ -152,8 +158,9 @@ class Workers:
 
     def _should_wake_another(self, own: Task) -> bool:
         """Return whether the waiting tasks, and `own` before them, take one worker longer than the threshold."""
-        busy = time.monotonic() - self._busy_since > BUSY_SECONDS
-        threshold = min(BUSY_THRESHOLD_SECONDS, WAKE_THRESHOLD_SECONDS) if busy else WAKE_THRESHOLD_SECONDS
+        threshold = REAL_TIME_THRESHOLD_SECONDS if self._real_time else WAKE_THRESHOLD_SECONDS
+        if time.monotonic() - self._busy_since > BUSY_SECONDS:
+            threshold = min(BUSY_THRESHOLD_SECONDS, threshold)
         seconds = own.estimated_seconds
         for _, _, task in self._ready:
             if seconds > threshold:
@@ -209,7 +216,7 @@ class Workers:
         while self._clients:
             if me.has_slot or self._free_slots:
                 while self._ready:
-                    task = self._pop_task(me) if self.count > 1 else heapq.heappop(self._ready)[2]
+                    task = self._pop_task(me) if len(self._workers) > 1 else heapq.heappop(self._ready)[2]
                     if not task.begin_work():
                         continue
                     me.task = task

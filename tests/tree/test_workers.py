@@ -176,6 +176,21 @@ def test_another_worker_is_woken_only_for_long_tasks(seconds: list[float], expec
     assert workers._should_wake_another(own) == (sum(seconds) > pool.BUSY_THRESHOLD_SECONDS)
 
 
+@pytest.mark.parametrize(
+    ("seconds", "expected"),
+    [([1e-3] * 12, False), ([2e-2, 1e-5], True), ([1e-3] * 30, True), ([math.inf, 1e-5], True)],
+)
+def test_in_real_time_another_worker_is_woken_for_20_ms_of_work(seconds: list[float], expected: bool) -> None:
+    """A block of 12000 frames takes about 10 ms; if the tree does not keep up, all workers are used as otherwise."""
+    own, *waiting = map(EstimatedTask, seconds)
+    workers = pool.Workers(threading.RLock(), 2, real_time=True)
+    for task in waiting:
+        workers.push(task)
+    assert workers._should_wake_another(own) == expected
+    workers._busy_since -= 2 * pool.BUSY_SECONDS
+    assert workers._should_wake_another(own)
+
+
 def test_the_pool_is_busy_only_until_all_workers_are_idle() -> None:
     """The next tasks are run by the worker that worked last."""
 
