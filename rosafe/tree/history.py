@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.tree.block import Block
 from rosafe.tree.sliding_window import SlidingWindow, WindowView, frames_in
+
+# Short blocks are added to the windows together, when they are read at the latest.
+MAX_PENDING = 8  # blocks
+MAX_PENDING_BYTES = 2**18  # of the first part of a block: longer ones are added immediately
 
 
 class HistorySlice(NamedTuple):
@@ -43,8 +48,9 @@ class History:
     ) -> None:
         self.seconds = seconds
         self.port_seconds = port_seconds
-        self.next_index = 0
-        self._lock = threading.Lock()
+        self._next_index = 0
+        self._pending: deque[Block] = deque()  # released, and not yet in the windows
+        self._lock = threading.Lock()  # guards all attributes
         self._signal = signal
         self._frames = (0.0, 0)  # seconds and frames of the windows
         self._clear(output_shapes)
@@ -57,18 +63,34 @@ class History:
 
     def append(self, block: Block) -> None:
         """Append a block. One with another shape or frame rate than before clears the history first."""
-        seconds = max(self.seconds, self.port_seconds)
-        if not seconds:
-            self.next_index = block.next_index
-            return
-        with self._lock:
+        pending = self._pending
+        pending.append(block)
+        if len(pending) >= MAX_PENDING or block.parts[0].nbytes > MAX_PENDING_BYTES:
+            with self._lock:
+                self._add_pending()
+
+    def _add_pending(self) -> None:
+        """Add the pending blocks to the windows."""
+        pending = self._pending
+        while pending:
+            block = pending.popleft()
+            self._next_index = block.next_index
+            seconds = max(self.seconds, self.port_seconds)
+            if not seconds:
+                continue
             shapes = [part.shape[:-1] for part in block.parts]
             if block.signal is not self._signal or shapes != self._shapes or seconds != self._frames[0]:
                 self._resize(block.signal, shapes, seconds)
-            self.next_index = block.next_index
             for window, part in zip(self._windows, block.parts, strict=True):
                 window.append(part)
             self._appended += block.parts[0].shape[-1]
+
+    @property
+    def next_index(self) -> int:
+        """Index of the audio frame after the newest one that the output depends on."""
+        with self._lock:
+            self._add_pending()
+            return self._next_index
 
     def _resize(self, signal: SignalFormat, shapes: list[tuple[int, ...]], seconds: float) -> None:
         """Adapt the windows to the format of a block and to their length in seconds."""
@@ -82,13 +104,15 @@ class History:
     def read_new(self, reader: str) -> HistorySlice:
         """Return the output since the last call by `reader`, or since the beginning, at most the history."""
         with self._lock:
+            self._add_pending()
             new = min(self._appended - self._read.get(reader, 0), frames_in(self.seconds, self._signal.rate))
             self._read[reader] = self._appended
-            return HistorySlice(tuple(window.view(new) for window in self._windows), self.next_index, self._signal)
+            return HistorySlice(tuple(window.view(new) for window in self._windows), self._next_index, self._signal)
 
     def port_window(self) -> HistorySlice:
         """Return the newest `port_seconds` of output, with zeros before the first block."""
         with self._lock:
+            self._add_pending()
             frames = frames_in(self.port_seconds, self._signal.rate)
             views = tuple(window.padded_view(frames) for window in self._windows)
-            return HistorySlice(views, self.next_index, self._signal)
+            return HistorySlice(views, self._next_index, self._signal)
