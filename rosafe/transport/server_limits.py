@@ -290,7 +290,7 @@ def _read_messages(self: Any, buffer: io.BytesIO, messages: list[Any], sock: soc
 
 def _read_rest(buffer: io.BytesIO, size: int, sock: socket.socket) -> memoryview:
     """Return the message of `size` bytes that begins in `buffer`, which is empty then."""
-    data = memoryview(np.empty(size, np.uint8))
+    data = np.empty(size, np.uint8).data
     at = buffer.tell() - _LENGTH.size
     data[:at] = buffer.getbuffer()[_LENGTH.size : _LENGTH.size + at]
     while at < size:

@@ -32,11 +32,8 @@ class Tree:
     ----------
     listener : TreeListener
         Is notified of every block and every removal.
-    workers : int, optional
-        Number of threads that compute. By default the value of the environment variable ROSAFE_WORKERS, or the number
-        of available cores. Raises ValueError if it is not between 1 and 1024.
-    real_time : bool
-        Whether blocks arrive in real time; see `Workers`.
+    workers, real_time : int (optional), bool
+        See `Workers`. By default as many workers as `workers_to_use` returns, which raises ValueError beyond its limits.
     """
 
     def __init__(self, listener: TreeListener, workers: int | None = None, real_time: bool = False) -> None:
