@@ -33,7 +33,7 @@ class Tree:
     listener : TreeListener
         Is notified of every block and every removal.
     workers, real_time : int (optional), bool
-        See `Workers`. By default as many workers as `workers_to_use` returns, which raises ValueError beyond its limits.
+        See `Workers`; by default as many as `workers_to_use` returns, which raises ValueError beyond its limits.
     """
 
     def __init__(self, listener: TreeListener, workers: int | None = None, real_time: bool = False) -> None:
