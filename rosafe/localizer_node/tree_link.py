@@ -19,6 +19,7 @@ import rospy
 from rosafe.client.component_client import ComponentClient
 from rosafe.client.graph import Graph, NotRegisteredError
 from rosafe.client.tcpros import ServiceClient, component_exception
+from rosafe.dsp.framing import FrameGrid
 from rosafe.interface import BLOCK_AND_BUFFERS, REQUEST, ROSAFE, ComponentError, format_value
 from rosafe.localization import cues
 from rosafe.localization.direction_model import DirectionModel
@@ -218,9 +219,9 @@ class TreeLink:
         self._watched, self._rate = {name: processors[name] for name in names}, rate
         self._input_of = self._created.node
         block = int(root.values["nFramesPerBlock"])
-        window, hop = _samples(model, "wSizeSec"), _samples(model, "hSizeSec")
-        _report_block(self._status, block, hop, rate)
-        return Link(model, FrameFormat(rate, model.channels, window, hop, block), topics)
+        grid = FrameGrid.design(rate, "cc", model.parameters)
+        _report_block(self._status, block, grid.hop, rate)
+        return Link(model, FrameFormat(rate, model.channels, len(grid.window), grid.hop, block), topics)
 
     async def _model_of_input(self, graph: Graph, service: ServiceClient, client: ComponentClient) -> DirectionModel:
         """Return the model for the input, which is created if there is none, or if the rate of the sound differs."""
@@ -228,7 +229,7 @@ class TreeLink:
             root = _input_of(await tree_builder.list_processors(client))
             if root is None:
                 model = await self._model(await self._wait_for_sound(client))
-                hop = _samples(model, "hSizeSec")
+                hop = FrameGrid.design(model.sample_rate, "cc", model.parameters).hop
                 frames = hop * max(1, round(BLOCK_SECONDS * model.sample_rate / hop))
                 await self._request(graph, service, "input", {"nFramesPerBlock": frames})
             elif (await self._sound_rate(client) or root.rate) != root.rate:
@@ -314,11 +315,6 @@ class TreeLink:
 
 def _input_of(processors: Iterable[ExistingProcessor]) -> ExistingProcessor | None:
     return next((processor for processor in processors if not processor.parent), None)
-
-
-def _samples(model: DirectionModel, name: str) -> int:
-    """Return the length or distance of frames in samples."""
-    return round(model.parameters[f"cc_{name}"] * model.sample_rate)
 
 
 def _report_block(status: NodeStatus, block: int, hop: int, rate: float) -> None:

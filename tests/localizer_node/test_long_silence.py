@@ -58,7 +58,8 @@ class Robot:
         )
         model = Localizer(RATE, str(head)).model
         window, hop = (round(model.parameters[f"cc_{name}"] * RATE) for name in ("wSizeSec", "hSizeSec"))
-        self.loop.connect(Link(model, FrameFormat(RATE, model.channels, window, hop, BLOCK), dict.fromkeys(cues.KINDS, "")))
+        frame_format = FrameFormat(RATE, model.channels, window, hop, BLOCK)
+        self.loop.connect(Link(model, frame_format, dict.fromkeys(cues.KINDS, "")))
         self._stream = Stream(RATE, model.parameters, list(cues.KINDS))
 
     def _publish(self, time: float, tracks: Any, *_: Any) -> None:

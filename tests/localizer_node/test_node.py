@@ -16,6 +16,7 @@ from rosafe.localization.localizer import Localizer as Offline
 from rosafe.localization.scene import SceneRenderer
 from rosafe.localization.scene_file import read_scene
 from rosafe.offline.stream import Stream
+from tests import models
 from tests.harness import Graph, Process, wait_for
 from tests.localization.conftest import KEMAR, RATE, modulated
 from tests.localizer_node.session import (
@@ -107,22 +108,38 @@ def test_the_end_of_the_sound(graph: Graph, localizer: Localizer, talker: Path, 
     assert ids == sorted(ids), "ids are not used again"
 
 
-def test_offline_and_live_agree(graph: Graph, bass: Process, sphere_model: Path, tmp_path: Path) -> None:
-    """The posterior of each frame is that of rosafe.Localizer for the same sound."""
+@pytest.mark.parametrize(("rate", "block", "created"), [(16000, 1600, False), (22050, 1105, True)])
+def test_offline_and_live_agree(
+    graph: Graph,
+    bass: Process,
+    tmp_path_factory: pytest.TempPathFactory,
+    tmp_path: Path,
+    rate: int,
+    block: int,
+    created: bool,
+) -> None:
+    """The posterior of each frame is that of rosafe.Localizer for the same sound.
+
+    The block is a multiple of the hop, also if the localizer creates the input: all frames begin at the same samples.
+    """
     import rosAFE.msg
 
-    block = 1600  # ten hops: the frames of both begin at the same samples
-    silence, sound = np.zeros((20 * block, 2), np.int32), two_talkers(8.0)
+    model = tmp_path / "sphere.head"
+    models.learn(tmp_path_factory, rate).save(model)
+    silence, sound = np.zeros((20 * block, 2), np.int32), two_talkers(8.0, rate)
     for name, samples in (("silence", silence), ("sound", sound)):
-        soundfile.write(tmp_path / f"{name}.wav", samples, RATE, subtype="PCM_32")
-    options = ("--head", str(sphere_model), "--rosafe", "exact")
+        soundfile.write(tmp_path / f"{name}.wav", samples, rate, subtype="PCM_32")
+    options = ("--head", str(model), "--rosafe", "exact")
     with graph.node("rosAFE-ros", "-i", "exact"):
         acquire(graph, f"file:{tmp_path / 'silence.wav'}?loop=1", chunk=block)
-        made = graph.call("/exact/request", representation="input", parameters=f"nFramesPerBlock: {block}", connect="")
-        assert made.genom_success, made.genom_exdetail
+        if not created:
+            parameters = f"nFramesPerBlock: {block}"
+            made = graph.call("/exact/request", representation="input", parameters=parameters, connect="")
+            assert made.genom_success, made.genom_exdetail
         with running_localizer(graph, *options, name="exact_localizer") as localizer:
             localizer.log("localizing with")
             localizer.state(lambda entries: entries["level"] == "0" and "localizing" in entries["message"])
+            assert localizer.block() == block
             with (
                 graph.collect("/exact_localizer/posterior", rosAFE.msg.DirectionPosterior) as live,
                 graph.collect("/exact/frameTime", rosAFE.msg.rosAFE_frameTime) as times,
@@ -131,12 +148,12 @@ def test_offline_and_live_agree(graph: Graph, bass: Process, sphere_model: Path,
                 wait_for(lambda: live and times)
                 acquire(graph, f"file:{tmp_path / 'sound.wav'}", chunk=block)
                 wait_for(lambda: 0 < len(sound) - times[-1].frameIndex < 2 * block)
-    offline = Offline(RATE, str(sphere_model))
-    features = Stream(RATE, offline.model.parameters, ["itd", "ild", "ic", "ratemap"]).process(
+    offline = Offline(rate, str(model))
+    features = Stream(rate, offline.model.parameters, ["itd", "ild", "ic", "ratemap"]).process(
         np.concatenate((silence, sound)).T
     )
     found = offline.update(features, features["itd_time"])
-    clock, hop = times[-1], offline.hop * RATE
+    clock, hop = times[-1], offline.hop * rate
     compared, certain = [], []
     for message in live:
         seconds = message.header.stamp.to_sec() - clock.stamp.to_sec()
@@ -151,17 +168,17 @@ def test_offline_and_live_agree(graph: Graph, bass: Process, sphere_model: Path,
     for message in list(tracked)[-40:]:
         at = (
             clock.frameIndex + (message.header.stamp.to_sec() - clock.stamp.to_sec()) * clock.sampleRate + len(silence)
-        ) / RATE
+        ) / rate
         sources = [t["azimuth"][int(np.abs(t["time"] - at).argmin())] for t in offline.tracks if t["first_time"] < at]
         near += [min(abs(azimuth - other) for other in sources) < 5 for azimuth in present(message)]
     assert len(near) > 20 and np.mean(near) > 0.9, near
 
 
-def two_talkers(seconds: float) -> np.ndarray:
+def two_talkers(seconds: float, rate: int) -> np.ndarray:
     """Return talkers at 50 and -30 degrees and some noise as int32, (n, 2)."""
     head = Head.sphere()
-    sound = head.render(modulated(seconds, 5), RATE, azimuth=50.0) + head.render(
-        np.roll(modulated(seconds, 6), RATE), RATE, azimuth=-30.0
+    sound = head.render(modulated(seconds, 5, rate), rate, azimuth=50.0) + head.render(
+        np.roll(modulated(seconds, 6, rate), rate), rate, azimuth=-30.0
     )
     sound += 3e-3 * np.random.default_rng(1).standard_normal(sound.shape)
     return np.round(sound.T * 2**30).astype(np.int32)
