@@ -1,7 +1,7 @@
 /* Evidence for directions: look-up of cues in the tables of a direction model (rosafe/localization/direction_model.py).
  *
  * The tables have numbers of half precision, so that sums in double precision are exact, whatever their order. */
-#include <stdint.h>
+#include "vector.h"
 
 enum { WIDTH = 8, VECTORS = 9, DIRECTIONS = WIDTH * VECTORS };
 
@@ -46,6 +46,7 @@ void rosafe_add_evidence(const struct cues *cues, double step, const int64_t *fr
             const int64_t at = frames[frame] * cues->channels + channel;
             if (!cues->valid[at]) continue;
             const struct rows rows = look_up(cues, step, at, channel);
+            UNROLL
             for (int v = 0; v < VECTORS; v++) {
                 const floats itd = rows.itd[v], ild = rows.ild[v];
                 sum[v] += factor * (__builtin_convertvector(itd, doubles) + __builtin_convertvector(ild, doubles));
@@ -61,6 +62,7 @@ void rosafe_unit_evidence(const struct cues *cues, double step, const int64_t *f
             const int64_t at = frames[frame] * cues->channels + channel;
             if (!cues->valid[at]) continue;
             const struct rows rows = look_up(cues, step, at, channel);
+            UNROLL
             for (int v = 0; v < VECTORS; v++, evidence += WIDTH) *(floats_anywhere *)evidence = rows.itd[v] + rows.ild[v];
         }
     }
