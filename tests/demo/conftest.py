@@ -1,21 +1,23 @@
-"""The model of the demo's head exists before the first demo starts: learning it takes half a minute of two cores."""
+"""Models of the demo's head for the tests and the programs that they start."""
 
 from __future__ import annotations
 
-import fcntl
+from collections.abc import Callable
 
 import pytest
 
-from rosafe.localization.localizer import SPHERE
-from rosafe.localization.model_cache import model_of
-from tests import harness
+from tests import models
 
-DEMO_RATE = 44100.0
+SCENE_RATE = 44100
+Learn = Callable[[int], object]
 
 
-@pytest.fixture(scope="session", autouse=True)
-def model_of_the_sphere(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Learn the model, in one process of a run of the tests, unless the user's cache has it."""
-    with open(harness.folder_of_run(tmp_path_factory) / "sphere.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        model_of(SPHERE, DEMO_RATE, None, lambda part: None)
+@pytest.fixture
+def learn(tmp_path_factory: pytest.TempPathFactory) -> Learn:
+    """Return a function that adds the model for a sample rate to the cache."""
+    return lambda sample_rate: models.learn(tmp_path_factory, sample_rate)
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(models.cache(tmp_path_factory)))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.demo.conftest import SCENE_RATE, Learn
 from tests.demo.running import DEMO_SECONDS, Demo, check_picture, check_table, demo, path
 from tests.demo.test_sound import wav
 from tests.harness import SCRIPTS, shared
@@ -23,11 +25,26 @@ def finished(running: Demo) -> str:
     return running.out
 
 
-def test_speech(tmp_path: Path) -> None:
-    """The shared speech is on the right until its end. Another ROS graph of the user has no effect."""
+def test_speech_without_home(tmp_path: Path, learn: Learn) -> None:
+    """The shared speech is on the right until its end. Another ROS graph of the user has no effect.
+
+    Home directory, a folder for matplotlib and a terminal are not needed.
+    """
+    learn(16000)
     speech = shared("audio", "speech_anechoic_16k.wav")
-    out = tmp_path / "new" / "folder"
-    with demo(speech, "--out", out, ROS_MASTER_URI="http://192.0.2.1:11311", ROS_NAMESPACE="/elsewhere") as running:
+    out, cache = tmp_path / "new" / "folder", tmp_path / "cache" / "rosafe"
+    cache.mkdir(parents=True)
+    (cache / "matplotlib").write_text("not a folder")
+    for model in Path(os.environ["XDG_CACHE_HOME"], "rosafe").glob("head-*.npz"):
+        os.link(model, cache / model.name)
+    with demo(
+        *(speech, "--out", out),
+        HOME="/dev/null/none",
+        XDG_CACHE_HOME=str(cache.parent),
+        LC_ALL="C",
+        ROS_MASTER_URI="http://192.0.2.1:11311",
+        ROS_NAMESPACE="/elsewhere",
+    ) as running:
         text = finished(running)
     check_table(text, 16000, 4000, 2.5)
     azimuths = np.array(path(text))
@@ -36,18 +53,24 @@ def test_speech(tmp_path: Path) -> None:
     check_picture(out / "rosafe-demo.png")
 
 
-def test_telephone_quality_without_home(tmp_path: Path) -> None:
-    """At 8 kHz, the highest channel is lower than in the user guide. Home directory and terminal are not needed."""
+def test_telephone_quality_until_ctrl_c(tmp_path: Path, learn: Learn) -> None:
+    """At 8 kHz, the highest channel is lower than in the user guide. Ctrl-C before the figure ends the demo."""
+    learn(8000)
     file = wav(tmp_path / "it's a call.wav", 8000, 2.2)
-    with demo(file, "--out", tmp_path, HOME="/dev/null/none", XDG_CACHE_HOME="", LC_ALL="C") as running:
-        text = finished(running)
-    assert "fb_highFreqHz 3600" in text and "fb_highFreqHz: 3600" in text
-    check_table(text, 8000, 2000, 2.0)
-    assert "\nthe last 0.20 s are shorter than a block of 2000 frames and are omitted\n" in text
+    with demo(file, "--out", tmp_path / "out") as running:
+        running.wait_for_output("direction of the source")
+        assert running.stop(signal.SIGINT) == 128 + signal.SIGINT
+        assert running.err == ""
+        running.assert_gone()
+    assert "fb_highFreqHz 3600" in running.out and "fb_highFreqHz: 3600" in running.out
+    check_table(running.out, 8000, 2000, 2.0)
+    assert "\nthe last 0.20 s are shorter than a block of 2000 frames and are omitted\n" in running.out
+    assert not (tmp_path / "out").exists()
 
 
-def test_a_closed_output_pipe_ends_the_demo(tmp_path: Path) -> None:
+def test_a_closed_output_pipe_ends_the_demo(tmp_path: Path, learn: Learn) -> None:
     """It is started through a symbolic link. When the reader of its output ends, all its processes end."""
+    learn(SCENE_RATE)
     link = tmp_path / "show"
     link.symlink_to(SCRIPTS / "demo")
     running = Demo("--out", tmp_path / "out", cwd=tmp_path, script=Path("/bin/sh"))
@@ -93,13 +116,14 @@ def test_errors_are_one_line(arguments: list[str], reason: str, code: int, tmp_p
     wav(tmp_path / "short.wav", seconds=0.1)
     before = sorted(tmp_path.rglob("*"))
     with demo(*arguments, cwd=tmp_path) as running:
-        assert running.wait() == code
+        assert running.wait(DEMO_SECONDS) == code  # the first one may build the kernels
         assert len(running.err.splitlines()) == 1 and reason in running.err
         running.assert_gone()
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_an_unknown_device_leaves_no_files(tmp_path: Path) -> None:
+def test_an_unknown_device_leaves_no_files(tmp_path: Path, learn: Learn) -> None:
+    learn(SCENE_RATE)
     with demo("hw:77,7", "--out", tmp_path / "out") as running:
         assert running.wait(DEMO_SECONDS) == 1
         assert running.err.startswith("demo: /bass/Acquire failed: ::bass::e_device: ")

@@ -9,17 +9,19 @@ import soundfile
 
 from rosafe.localization import model_cache
 from tests.bass.pulseaudio import PulseServer
+from tests.demo.conftest import SCENE_RATE, Learn
 from tests.demo.running import DEMO_SECONDS, PORTS, Demo, path, table
 
 
 def environment(pulse: PulseServer) -> dict[str, str]:
-    """Return the environment for the sound server, with the user's models of heads."""
+    """Return the environment for the sound server, with the models of heads."""
     return {**pulse.env, "XDG_CACHE_HOME": str(model_cache.folder().parent)}
 
 
-def test_device(pulse: PulseServer, tmp_path: Path) -> None:
+def test_device(pulse: PulseServer, tmp_path: Path, learn: Learn) -> None:
     """Noise from the left: the requested duration on all ports, and azimuths on the left."""
-    noise = 0.1 * np.random.default_rng(0).normal(0, 1, 60 * 44100)
+    learn(SCENE_RATE)
+    noise = np.tile(0.1 * np.random.default_rng(0).normal(0, 1, 10 * 44100), round(DEMO_SECONDS / 10))
     delayed = np.concatenate((np.zeros(16), 0.4 * noise[:-16]))
     soundfile.write(tmp_path / "left.wav", np.stack((noise, delayed), axis=1), 44100, subtype="PCM_16")
     with (
@@ -37,8 +39,9 @@ def test_device(pulse: PulseServer, tmp_path: Path) -> None:
         assert np.median(azimuths[:, 1]) > 10  # degrees; left is positive
 
 
-def test_unplugged(pulse: PulseServer, tmp_path: Path) -> None:
+def test_unplugged(pulse: PulseServer, tmp_path: Path, learn: Learn) -> None:
     """If the device is unplugged during the recording, one line reports it, and no figure is saved."""
+    learn(SCENE_RATE)
     with Demo("pulse", "--seconds", "60", "--out", tmp_path / "out", env=environment(pulse)) as running:
         running.wait_for_output("recording")
         pulse.kill()

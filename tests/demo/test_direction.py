@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,17 +25,12 @@ class Sound:
         self.ports = {"input": SimpleNamespace(take_sound=lambda: next(self._blocks))}
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Use an empty cache of models, which are learned from less sound than usual."""
-    folder = tmp_path_factory.mktemp("cache")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "SOUND_SECONDS", 200.0)
-        patch.setenv("XDG_CACHE_HOME", str(folder))
-        yield folder
-
-
-def test_the_newest_sound_since_the_start_of_the_audio_is_localized(cache: Path) -> None:
+def test_the_newest_sound_since_the_start_of_the_audio_is_localized(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With an empty cache of models, which are learned from less sound than usual."""
+    monkeypatch.setattr(training, "SOUND_SECONDS", 200.0)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     head = Head.sphere()
     lines: list[str] = []
     finder = DirectionFinder(RATE, head, lines.append)

@@ -10,15 +10,23 @@ from pathlib import Path
 
 import pytest
 
+from tests.demo.conftest import Learn
 from tests.demo.running import Demo, demo
+from tests.demo.test_sound import wav
 from tests.harness import ROOT, wait_for
 
 STAGES = {
     "start": "starting bass-ros and rosAFE-ros",
     "requests": "rosservice call /rosAFE/GammatoneProc",
-    "recording": "source",
-    "figure": "direction of the source",
+    "recording": "recording 7 ports",
 }
+
+
+@pytest.fixture
+def sound(tmp_path: Path, learn: Learn) -> Path:
+    """Return a file of sound at a low sample rate, which takes little computation."""
+    learn(8000)
+    return wav(tmp_path / "noise.wav", 8000, 12.0)
 
 
 @pytest.mark.parametrize(
@@ -28,11 +36,11 @@ STAGES = {
         ("start", signal.SIGINT),
         ("requests", signal.SIGTERM),
         ("recording", signal.SIGINT),
-        ("figure", signal.SIGINT),
     ],
 )
-def test_signal(stage: str, number: signal.Signals, tmp_path: Path) -> None:
-    with demo("--seconds", "2", "--out", tmp_path / "out") as running:
+def test_signal(stage: str, number: signal.Signals, tmp_path: Path, sound: Path) -> None:
+    """A later stage is in test_demo.py."""
+    with demo(sound, "--out", tmp_path / "out") as running:
         running.wait_for_output(STAGES[stage])
         assert running.stop(number) == 128 + number
         assert running.err == ""
@@ -40,9 +48,9 @@ def test_signal(stage: str, number: signal.Signals, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_repeated_ctrl_c_does_not_interrupt_the_clean_up(tmp_path: Path) -> None:
+def test_repeated_ctrl_c_does_not_interrupt_the_clean_up(tmp_path: Path, sound: Path) -> None:
     """A terminal sends it repeatedly to the whole process group."""
-    with demo("--seconds", "2", "--out", tmp_path / "out") as running:
+    with demo(sound, "--out", tmp_path / "out") as running:
         running.wait_for_output(STAGES["requests"])
         for _ in range(50):
             os.killpg(running.pid, signal.SIGINT)
@@ -52,16 +60,16 @@ def test_repeated_ctrl_c_does_not_interrupt_the_clean_up(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("stage", ["start", "requests"])
-def test_sigkill_also_ends_the_children(stage: str, tmp_path: Path) -> None:
-    with demo("--seconds", "2", "--out", tmp_path / "out", TMPDIR=str(tmp_path)) as running:
+def test_sigkill_also_ends_the_children(stage: str, tmp_path: Path, sound: Path) -> None:
+    with demo(sound, "--out", tmp_path / "out", TMPDIR=str(tmp_path)) as running:
         running.wait_for_output(STAGES[stage])
         running.stop(signal.SIGKILL)
         running.assert_gone()
 
 
 @pytest.mark.parametrize("node, stage", [("bass-ros", "requests"), ("rosAFE-ros", "recording")])
-def test_the_crash_of_a_node_ends_the_demo(node: str, stage: str, tmp_path: Path) -> None:
-    with demo("--out", tmp_path / "out") as running:
+def test_the_crash_of_a_node_ends_the_demo(node: str, stage: str, tmp_path: Path, sound: Path) -> None:
+    with demo(sound, "--out", tmp_path / "out") as running:
         running.wait_for_output(STAGES[stage])
         victim = next(pid for pid, command in running.processes().items() if command.endswith(f"/{node} "))
         os.kill(victim, signal.SIGKILL)

@@ -14,8 +14,9 @@ import soundfile
 
 import rosafe
 from rosafe import interface
-from rosafe.localization import model_cache, training
+from rosafe.localization import training
 from rosafe.transport.master import is_local
+from tests.demo.conftest import SCENE_RATE, Learn
 from tests.demo.running import check_picture, check_walk, marked_processes, new_mark
 from tests.genomix import world as worlds
 from tests.harness import PYTHON, ROOT, SCRIPTS, Process, free_port, wait_for
@@ -35,7 +36,6 @@ def blocks(language: str) -> list[str]:
 def link_checkout(folder: Path) -> dict[str, str]:
     """Fill `folder` with links to the checkout, and return an environment for the commands of the README.
 
-    The models of heads are those of the user: learning one takes half a minute.
     Wrappers in its PATH do what a user does: they set the port of roscore, end `rostopic hz`, and wait for the nodes.
     """
     for entry in ROOT.iterdir():
@@ -69,12 +69,12 @@ exec /usr/bin/rosservice "$@"
         "PATH": f"{tools}:/usr/local/bin:/usr/bin:/bin",
         "ROS_MASTER_URI": uri,
         "HOME": str(folder),
-        "XDG_CACHE_HOME": str(model_cache.folder().parent),
     }
 
 
-def test_all_shell_commands(tmp_path: Path) -> None:
+def test_all_shell_commands(tmp_path: Path, learn: Learn) -> None:
     """Run the commands in one bash that stops at the first error."""
+    learn(SCENE_RATE)
     commands = [line for block in blocks("sh") for line in block.splitlines() if line != WHOLE_SUITE]
     assert commands[0] == "scripts/demo" and WHOLE_SUITE in README
     assert ". scripts/env.sh" in commands and "roscore & bass-ros & rosAFE-ros &" in commands
