@@ -15,7 +15,7 @@ from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.head import checked_rate
 from rosafe.localization.results import read_recordings
 from rosafe.localization.sofa import MAX_GAP
-from rosafe.localization.training import SNR_DB, Progress
+from rosafe.localization.training import Progress
 from rosafe.offline.sounds import open_sound
 from rosafe.terminal import printable
 
@@ -96,7 +96,7 @@ def _sounds(
     everything = list(recorded.values())
     for number, (azimuth, sound) in enumerate(recorded.items()):
         count = sound.shape[1]
-        for snr in SNR_DB:
+        for snr in training.SNR_DB:
             noise = np.zeros((2, count))
             for _ in range(_MIXED):
                 other = everything[random.integers(len(everything))]
