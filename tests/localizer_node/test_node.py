@@ -108,7 +108,9 @@ def test_the_end_of_the_sound(graph: Graph, localizer: Localizer, talker: Path, 
     assert ids == sorted(ids), "ids are not used again"
 
 
-@pytest.mark.parametrize(("rate", "block", "created"), [(16000, 1600, False), (22050, 1105, True)])
+@pytest.mark.parametrize(
+    ("rate", "block", "created"), [(16000, 1600, False), (22050, 1105, True), (16000, 2048, False)]
+)
 def test_offline_and_live_agree(
     graph: Graph,
     bass: Process,
@@ -120,7 +122,8 @@ def test_offline_and_live_agree(
 ) -> None:
     """The posterior of each frame is that of rosafe.Localizer for the same sound.
 
-    The block is a multiple of the hop, also if the localizer creates the input: all frames begin at the same samples.
+    If the block is a multiple of the hop, as that of an input that the localizer creates, all frames begin at the same
+    samples. Otherwise only the sources are the same.
     """
     import rosAFE.msg
 
@@ -162,8 +165,9 @@ def test_offline_and_live_agree(
         if end > len(silence) / hop + 100 and abs(found["time"][nearest] / offline.hop - end) < 0.2:
             compared.append(np.abs(found["posterior"][nearest] - np.array(message.probability)).max())
             certain.append(found["posterior"][nearest].max())
-    assert len(compared) >= 40 and min(certain) < 0.9
-    assert np.max(compared) < 1e-6, (np.median(compared), np.max(compared))
+    if block % round(hop) == 0:
+        assert len(compared) >= 40 and min(certain) < 0.9
+        assert np.max(compared) < 1e-6, (np.median(compared), np.max(compared))
     near = []
     for message in list(tracked)[-40:]:
         at = (
