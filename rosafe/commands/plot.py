@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
                 warnings.simplefilter("always", UserWarning)
                 result = process(sound, rate, parameters=parameters, outputs=outputs)
             for text in dict.fromkeys(str(one.message) for one in caught):
-                print(f"rosafe plot: {text}", file=sys.stderr)
+                print(f"rosafe plot: {text.replace('pad=True', 'rosafe process --pad')}", file=sys.stderr)
         figure = draw(Figure(), result, names, options.ear, at=options.at, channel=options.channel)
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None

@@ -38,7 +38,7 @@ from rosafe.commands._workers import Interrupted, Interrupts, TaskReport, run_pa
 from rosafe.declarations.text import bytes_text
 from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE, Parameter
 from rosafe.interface.arguments import check_outputs
-from rosafe.interface.remarks import NO_FRAMES, warnings_of
+from rosafe.interface.remarks import no_frames, warnings_of
 from rosafe.terminal import printable
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
@@ -411,8 +411,7 @@ class _Corpus:
             if done.clipped:
                 self.display.message(f"rosafe process: {source}: {clipping_warning(done.clipped)}")
             if done.empty:
-                names = ", ".join(done.empty)
-                self.display.message(f"rosafe process: {source}: {names}: no frames: {NO_FRAMES}; see --pad")
+                self.display.message(f"rosafe process: {source}: {no_frames(done.empty, False, '--pad')}")
             text = f"{source} -> {target}: {done.seconds:.1f} s of sound, {bytes_text(done.size)}"
             if done.not_finite:
                 text += f"; {done.not_finite} samples were NaN or infinite and were replaced by silence or full scale"

@@ -12,7 +12,6 @@ from rosafe.interface.arguments import check_parameter
 PRESETS: dict[str, dict[str, Any]] = {
     "speech": {"ac_wSizeSec": 0.06, "pi_rangeHz": [60.0, 400.0], "pi_confThres": 0.2, "pi_medianOrder": 7},
 }
-NO_FRAMES = "the sound is shorter than the windows that they need"
 MIN_PLAUSIBLE_RATE = 400.0  # Hz; below it, errors suggest that the sample rate is given in kHz
 MIN_PERIODS = 3.0  # of the lowest pitch in the window of the autocorrelation
 
@@ -38,6 +37,12 @@ def short_window(range_hz: Collection[float], seconds: float) -> str:
         f"{lowest:g} Hz, the lowest pitch of the range; pitches below {MIN_PERIODS / seconds:.0f} Hz are unreliable "
         'and may be reported as higher ones; for voices use rosafe.PRESETS["speech"] (--preset speech)'
     )
+
+
+def no_frames(kinds: Collection[str], empty: bool, option: str) -> str:
+    """Return the warning about outputs without frames, for a sound that is `empty` or too short without `option`."""
+    reason = "has no samples" if empty else f"is shorter than the windows that they need; see {option}"
+    return f"{', '.join(kinds)}: no frames: the sound {reason}"
 
 
 def rate_advice(problem: ValueError, sample_rate: float) -> ValueError:

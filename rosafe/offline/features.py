@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import inspect
+import warnings
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -10,7 +12,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy.signal
 
-from rosafe.offline.process import process
+from rosafe.declarations.checks import is_number
+from rosafe.declarations.text import join_names, short_repr
+from rosafe.interface.remarks import unknown_argument
+from rosafe.offline.process import ProcessCall, process
 from rosafe.offline.result import Result
 from rosafe.tree.workers import workers_to_use
 
@@ -41,7 +46,8 @@ def to_db(
     Raises
     ------
     ValueError
-        For negative values, and for a reference that is not positive.
+        For values that are negative or not real numbers, a reference that is not positive and finite, and a floor that
+        is not a finite number.
 
     Examples
     --------
@@ -50,13 +56,19 @@ def to_db(
     array([  0., -20., -80.])
     """
     array = np.asarray(values)
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"values: expected real numbers, got {array.dtype}")
     array = array if array.dtype.kind == "f" else array.astype(np.float64)
     if np.any(array < 0):
         raise ValueError(f"values: expected no negative numbers, got {np.nanmin(array):g}")
-    largest = reference == "max"
-    if not largest and (isinstance(reference, str) or not reference > 0):
-        raise ValueError(f'reference: expected a positive number or "max", got {reference!r}')
-    one = max(float(np.nanmax(array, initial=0.0)), _TINY) if largest else float(reference)
+    if isinstance(reference, str) and reference == "max":
+        one = max(float(np.nanmax(array, initial=0.0)), _TINY)
+    else:
+        one = float(reference) if is_number(reference) else 0.0
+    if not 0 < one < np.inf:
+        raise ValueError(f'reference: expected a positive finite number or "max", got {short_repr(reference)}')
+    if floor is not None and not is_number(floor):
+        raise ValueError(f"floor: expected a finite number of dB or None, got {short_repr(floor)}")
     with np.errstate(divide="ignore"):
         levels = (10.0 if power else 20.0) * np.log10(array / array.dtype.type(one))
     return levels if floor is None else np.maximum(levels, array.dtype.type(floor))
@@ -87,7 +99,8 @@ def deltas(values: npt.ArrayLike, width: int = 9, order: int = 1, axis: int = -1
     Raises
     ------
     ValueError
-        For an unsuitable width or order.
+        For an unsuitable width, order or axis, and for values that are not finite, such as the pitch of unvoiced
+        frames.
 
     Examples
     --------
@@ -96,7 +109,14 @@ def deltas(values: npt.ArrayLike, width: int = 9, order: int = 1, axis: int = -1
     array([2., 2., 2., 2., 2., 2., 2., 2., 2., 2.])
     """
     array = np.asarray(values, np.float64)
-    frames = array.shape[axis] if array.ndim else 0
+    for name, number in (("width", width), ("order", order), ("axis", axis)):
+        if not isinstance(number, (int, np.integer)) or isinstance(number, bool):
+            raise ValueError(f"{name}: expected an integer, got {short_repr(number)}")
+    if not -array.ndim <= axis < array.ndim:
+        raise ValueError(f"axis: expected one of the {array.ndim} axes of values, got {axis}")
+    if not np.isfinite(array).all():
+        raise ValueError("values: expected finite numbers, got NaN or infinite ones; replace them first")
+    frames = array.shape[axis]
     if order < 1 or width % 2 != 1 or not max(3, order + 1) <= width <= frames:
         raise ValueError(
             f"width: expected an odd number of frames from {max(3, order + 1)} to {frames} and an order of at least 1, "
@@ -129,14 +149,27 @@ def process_batch(signals: Iterable[Any], sample_rate: float, **options: Any) ->
     ------
     ValueError
         As `rosafe.process`; the message begins with the number of the sound, from 0.
-    """
 
-    def compute(numbered: tuple[int, Any]) -> Result:
+    Warns
+    -----
+    UserWarning
+        As `rosafe.process`, once for each text; with the numbers of the sounds if it does not apply to all.
+    """
+    for name in options.keys() - inspect.signature(process).parameters.keys():
+        raise unknown_argument(name, "process_batch")
+
+    def compute(numbered: tuple[int, Any]) -> tuple[Result, Sequence[str]]:
         number, signal = numbered
         try:
-            return process(signal, sample_rate, **options)
+            call = ProcessCall(signal, sample_rate, **options)
+            return call.run(), call.warnings
         except ValueError as problem:
             raise ValueError(f"sound {number}: {problem}") from None
 
     with ThreadPoolExecutor(workers_to_use()) as pool:
-        return list(pool.map(compute, enumerate(signals)))
+        computed = list(pool.map(compute, enumerate(signals)))
+    for text in dict.fromkeys(text for _, texts in computed for text in texts):
+        sounds = [str(number) for number, (_, texts) in enumerate(computed) if text in texts]
+        which = "" if len(sounds) == len(computed) else f"sounds {join_names(sounds)}: "
+        warnings.warn(f"{which}{text}", UserWarning, 2)
+    return [result for result, _ in computed]

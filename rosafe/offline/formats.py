@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,7 +101,7 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     return FORMATS[extension]
 
 
-def check_format(file_format: Format, outputs: Iterable[str]) -> None:
+def check_format(file_format: Format, outputs: Collection[str]) -> None:
     """Raise ValueError if a format cannot store these outputs, or ModuleNotFoundError if its package is missing."""
     if file_format.module:
         require(file_format.module, f"{file_format.extension} files")
@@ -110,7 +110,7 @@ def check_format(file_format: Format, outputs: Iterable[str]) -> None:
         if len(parts) != 1 or len(parts[0].axes) != 2:
             possible = [kind for kind, one in KINDS.items() if [len(p.axes) for p in one.outputs.values()] == [2]]
             raise ValueError(
-                f"a .csv contains one output of two axes; name one of {', '.join(possible)} with --outputs"
+                f"outputs: expected for a .csv one output of two axes ({', '.join(possible)}), got {', '.join(outputs)}"
             )
 
 

@@ -17,7 +17,7 @@ from rosafe.declarations.text import short_repr
 from rosafe.dsp.stage import SAMPLE_RATE
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_parameters
-from rosafe.interface.remarks import NO_FRAMES, rate_advice, unknown_argument, warnings_of
+from rosafe.interface.remarks import no_frames, rate_advice, unknown_argument, warnings_of
 from rosafe.offline import chain
 from rosafe.offline.chain import Chain, FrameLimiter, computed_ears, effective_parameters
 from rosafe.offline.collector import OutputCollector, allocate_branches, join_branches
@@ -119,10 +119,13 @@ def process(
     if positional:
         options = _merge_positional(positional, options)
     try:
-        call = _ProcessCall(signal, sample_rate, *options, pad=pad, dtype=dtype)
+        call = ProcessCall(signal, sample_rate, *options, pad=pad, dtype=dtype)
     except ValueError as problem:
         raise problem.with_traceback(None) from None  # internal frames do not help the caller
-    return call.run()
+    result = call.run()
+    for text in call.warnings:
+        warnings.warn(text, UserWarning, 2)
+    return result
 
 
 process.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
@@ -139,24 +142,27 @@ def _merge_positional(positional: tuple[Any, ...], options: tuple[Any, Any, Any,
     return (*positional, *options[len(positional) :])
 
 
-class _ProcessCall:
-    """One call of `process` with checked arguments. Nothing is computed before `run`."""
+class ProcessCall:
+    """One call of `process` with checked arguments. Nothing is computed before `run`, which sets `warnings`."""
+
+    warnings: Sequence[str] = ()
 
     def __init__(
         self,
         signal: Any,
         sample_rate: Any,
-        parameters: Any,
-        block_frames: Any,
-        modifications: Any,
-        outputs: Any,
-        pad: Any,
-        dtype: Any,
+        parameters: Any = None,
+        block_frames: Any = DEFAULT_FRAMES_PER_BLOCK,
+        modifications: Any = (),
+        outputs: Any = None,
+        pad: Any = False,
+        dtype: Any = "float64",
     ) -> None:
         view = ears_view(signal)
         self.ears, frames = view.shape
         self.rate = SAMPLE_RATE.check(sample_rate)
         lengths = _block_lengths(block_frames)
+        padded = _checked_pad(pad)
         self.dtype = _checked_dtype(dtype)
         self.values = {"in_doNormalize": view.dtype.kind == "i", **check_parameters(parameters)}
         changes = _checked_modifications(modifications)
@@ -174,7 +180,7 @@ class _ProcessCall:
         except ValueError as problem:
             raise rate_advice(problem, self.rate) from None
         try:
-            self._prepare(frames, lengths, changes, bool(pad))
+            self._prepare(frames, lengths, changes, padded)
             check_finite(view)  # last, because it reads the whole signal
         except BaseException:
             self.chain.close()
@@ -250,8 +256,6 @@ class _ProcessCall:
     def run(self) -> Result:
         """Compute and return the results, whose collectors are dropped."""
         parameters = effective_parameters(self.values, self.outputs, self.rate)
-        for text in warnings_of(parameters, self.outputs):
-            warnings.warn(text, UserWarning, 3)
         with self.chain:
             self.chain.run(merge=True)
             results: dict[str, Any] = {}
@@ -263,8 +267,9 @@ class _ProcessCall:
             results |= self.chain.describe()
         result = Result(results, parameters=parameters, sample_rate=self.rate, version=VERSION)
         framed = [kind for kind in self.outputs if f"{kind}_frameRate" in result]
+        self.warnings = warnings_of(parameters, self.outputs)
         if empty := [kind for kind in framed if not len(result[f"{kind}_time"])]:
-            warnings.warn(f"{', '.join(empty)}: no frames: {NO_FRAMES}; see pad=True", UserWarning, 3)
+            self.warnings.append(no_frames(empty, not self.frames, "pad=True"))
         return result
 
 
@@ -281,6 +286,12 @@ def _block_lengths(block_frames: Any) -> list[int]:
             f"block_frames: expected a positive integer or a sequence of these, got {short_repr(block_frames)}"
         )
     return list(map(int, lengths))
+
+
+def _checked_pad(pad: Any) -> bool:
+    if not isinstance(pad, (bool, int, np.bool_, np.integer)) or pad not in (0, 1):
+        raise ValueError(f"pad: expected a boolean, got {short_repr(pad)}")
+    return bool(pad)
 
 
 def _checked_dtype(dtype: Any) -> np.dtype[Any]:

@@ -58,7 +58,7 @@ class Result(dict[str, Any]):
     ) -> None:
         super().__init__(entries)
         self.parameters = dict(parameters)
-        self.sample_rate = sample_rate
+        self.sample_rate = float(sample_rate)  # files contain whole rates as integers
         self.version = version
         self.clipped = clipped
 

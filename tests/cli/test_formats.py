@@ -125,7 +125,8 @@ def test_csv(tmp_path: Path, sound: Path, output: str) -> None:
 
 @pytest.mark.parametrize("outputs", [["ratemap"], ["ild", "itd"], ["precedence"], None])
 def test_csv_accepts_tables_only(tmp_path: Path, sound: Path, outputs: list[str] | None) -> None:
-    with pytest.raises(ValueError, match="one output of two axes; name one of input, preProc, ild"):
+    match = r"^outputs: expected for a \.csv one output of two axes \(input, preProc, ild, .*\), got "
+    with pytest.raises(ValueError, match=match):
         process_file(sound, tmp_path / "result.csv", outputs=outputs)
     assert not (tmp_path / "result.csv").exists()
 

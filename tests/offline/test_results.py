@@ -77,6 +77,11 @@ def test_copies_keep_the_attributes(result: rosafe.Result) -> None:
         assert_same(other, result)
 
 
+def test_loaded_attributes_have_the_declared_types(tmp_path: Path, result: rosafe.Result) -> None:
+    result.save(tmp_path / "result.npz")
+    assert type(result.sample_rate) is type(rosafe.load(tmp_path / "result.npz").sample_rate) is float
+
+
 def test_plot_and_xarray(result: rosafe.Result) -> None:
     pytest.importorskip("matplotlib").use("Agg")
     assert len(result.plot(["ild"]).axes) == 2  # with its colour bar
@@ -291,6 +296,14 @@ def test_the_preset_for_speech_on_vowels(rate: int) -> None:
 def test_outputs_without_frames() -> None:
     with pytest.warns(UserWarning, match="ild, ratemap: no frames: the sound is shorter than the windows"):
         rosafe.process(SOUND[:, :300], RATE, parameters=FEW, outputs=["ild", "ratemap", "input"])
+    with pytest.warns(UserWarning, match=r"^ild: no frames: the sound has no samples$"):
+        rosafe.process(SOUND[:, :0], RATE, parameters=FEW, outputs="ild", pad=True)
+
+
+@pytest.mark.parametrize("pad", ["x", None, 2, 0.5, [True]])
+def test_pad_is_a_boolean(pad: Any) -> None:
+    with pytest.raises(ValueError, match=r"^pad: expected a boolean, got "):
+        rosafe.process(SOUND, RATE, parameters=FEW, outputs="ild", pad=pad)
 
 
 def test_misplaced_arguments() -> None:
@@ -319,9 +332,18 @@ def test_levels() -> None:
     assert rosafe.to_db(values.astype(np.float32)).dtype == np.float32
     assert (rosafe.to_db(np.zeros(3), reference="max") == -80).all()
     assert rosafe.to_db([1, 10], 10.0).tolist() == [-20.0, 0.0]
-    for bad in (0.0, -1.0, "mean", np.nan):
-        with pytest.raises(ValueError, match=r"^reference: "):
+    bad: Any
+    for bad in (0.0, -1.0, "mean", np.nan, np.inf, None, np.ones(3)):
+        with pytest.raises(ValueError, match=r"^reference: expected a positive finite number or \"max\", got "):
             rosafe.to_db(values, bad)
+    with pytest.raises(ValueError, match=r"^reference: "):
+        rosafe.to_db([1.0, np.inf], "max")
+    for bad in ("x", np.nan, [0.0]):
+        with pytest.raises(ValueError, match=r"^floor: expected a finite number of dB or None, got "):
+            rosafe.to_db(values, floor=bad)
+    for bad in ([1j], ["1"], [None]):
+        with pytest.raises(ValueError, match=r"^values: expected real numbers, got "):
+            rosafe.to_db(bad)
     with pytest.raises(ValueError, match=r"^values: expected no negative numbers, got -1"):
         rosafe.to_db([-1.0])
 
@@ -336,6 +358,13 @@ def test_deltas() -> None:
     for width, order in ((4, 1), (1, 1), (21, 1), (3, 3), (5, 0)):
         with pytest.raises(ValueError, match=r"^width: expected an odd number of frames"):
             rosafe.deltas(curve, width, order)
+    wrong: Any
+    for name, wrong in (("width", 5.0), ("width", None), ("order", 1.5), ("order", True), ("axis", 0.0), ("axis", 2)):
+        with pytest.raises(ValueError, match=rf"^{name}: expected .*, got {wrong}$"):
+            rosafe.deltas(curve, **{name: wrong})
+    curve[0, 3] = np.nan  # as the pitch of an unvoiced frame
+    with pytest.raises(ValueError, match=r"^values: expected finite numbers, got NaN"):
+        rosafe.deltas(curve)
 
 
 def test_a_batch_equals_single_calls() -> None:
@@ -346,3 +375,15 @@ def test_a_batch_equals_single_calls() -> None:
     assert len(rosafe.process_batch(np.zeros((3, 2, 400)), RATE, parameters=FEW, outputs="ild")) == 3
     with pytest.raises(ValueError, match=r"^sound 1: signal: expected finite"):
         rosafe.process_batch([SOUND, np.full(10, np.nan)], RATE)
+
+
+def test_warnings_of_a_batch() -> None:
+    """A warning about all sounds is issued once; others name the sounds; all refer to the line of the caller."""
+    sounds = [SOUND, SOUND[:, :100], SOUND[0]]
+    with pytest.warns(UserWarning) as caught:
+        rosafe.process_batch(sounds, RATE, parameters=FEW, outputs="pitch")
+    assert {one.filename for one in caught} == {__file__}
+    texts = [str(one.message) for one in caught]
+    assert [text.partition(":")[0] for text in texts] == ["pi_rangeHz, ac_wSizeSec", "sounds 1"]
+    with pytest.raises(TypeError, match=r"^process_batch\(\) got an unexpected keyword argument 'fb_nChannels'; pass"):
+        rosafe.process_batch(sounds, RATE, fb_nChannels=4)
