@@ -102,7 +102,7 @@ def test_sound_file_opens_no_other_file(tmp_path: Path) -> None:
     path = tmp_path / "noise.wav"
     path.write_bytes(b"no sound " * 100)
     os.mkfifo(tmp_path / "._noise.wav")
-    with pytest.raises(AudioFileError, match="is not a sound file"):
+    with pytest.raises(AudioFileError, match="expected a sound file, got another file"):
         AudioFile(path)
 
 
@@ -111,7 +111,7 @@ def test_extension_makes_no_sound_file(tmp_path: Path, extension: str) -> None:
     """With formats without a header, any file would be sound."""
     path = tmp_path / f"secret{extension}"
     path.write_bytes(b"a secret " * 1000)
-    with pytest.raises(AudioFileError, match="is not a sound file"):
+    with pytest.raises(AudioFileError, match="expected a sound file, got another file"):
         AudioFile(path)
 
 

@@ -144,7 +144,7 @@ def _converted(service: Service, pairs: list[tuple[str, Any]]) -> dict[str, Any]
     for name, value in pairs:
         parameter = _parameter(service, name)
         if parameter.name in values:
-            raise bad_value(f"{service.name}: {parameter.name} is given twice")
+            raise bad_value(f"{service.name}: {parameter.name}: expected one value, got two")
         values[parameter.name] = _convert(service, parameter, value)
     return values
 
@@ -170,7 +170,8 @@ def _named(service: Service, text_args: Any) -> list[tuple[str, Any]]:
     if not isinstance(text_args, (list, tuple)):
         raise bad_value(f"input: expected an object or an array; {expected(service)}")
     if len(text_args) > len(service.parameters):
-        raise bad_value(f"{len(text_args)} arguments are too many; {expected(service)}")
+        what = f"expected at most {len(service.parameters)} arguments, got {len(text_args)}"
+        raise bad_value(f"{service.name}: {what}; {expected(service)}")
     return [(p.name, value) for p, value in zip(service.parameters, text_args, strict=False)]
 
 
@@ -179,7 +180,8 @@ def _parameter(service: Service, name: str) -> Parameter:
         return service.parameter(name)
     except KeyError:
         known = [p.name for p in service.parameters]
-        raise bad_value(f"unknown parameter {name[:80]!r}; {expected(service)}{did_you_mean(name, known)}") from None
+        what = f"expected a known parameter, got {name[:80]!r}"
+        raise bad_value(f"{service.name}: {what}; {expected(service)}{did_you_mean(name, known)}") from None
 
 
 def _convert(service: Service, parameter: Parameter, value: Any) -> Any:

@@ -87,7 +87,7 @@ def parameters_of(settings: list[str], preset: str | None = None) -> dict[str, A
         name, _, text = setting.partition("=")
         name, value = check_parameter(name, text, text=True)
         if name in values:
-            raise ValueError(f"{name} is given twice")
+            raise ValueError(f"{name}: expected one value, got two")
         values[name] = value
     return {**PRESETS[preset], **values} if preset else values
 

@@ -110,7 +110,9 @@ def _result(path: Path, settings: list[str]) -> Mapping[str, Any]:
     from rosafe.offline.formats import load
 
     if settings:
-        raise ValueError("--set: a result already has its parameters; name the sound instead")
+        raise ValueError(
+            "--set: expected a sound, got a result, which already has its parameters; name the sound instead"
+        )
     try:
         return load(path)
     except OSError as problem:

@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
         values = {"representation": kind.word}
         for name, value in map(_parameter, [*options.settings, *options.interspersed]):
             if name in values:
-                raise ValueError(f"{name} is given twice")
+                raise ValueError(f"{name}: expected one value, got two")
             values[name] = value
     except ValueError as problem:
         raise CommandError(str(problem)) from None
@@ -95,7 +95,8 @@ def _parameter(setting: str) -> tuple[str, Any]:
     if parameter is None:
         known = [p.name for p in _SETTINGS]
         raise ValueError(
-            f"unknown parameter {short_repr(name)}; there are: {', '.join(known)}{did_you_mean(name, known)}"
+            f"parameters: expected a known parameter, got {short_repr(name)}; there are: {', '.join(known)}"
+            f"{did_you_mean(name, known)}"
         )
     if name in request.OF_THE_INPUT:
         return name, parameter.parse(text)

@@ -123,7 +123,10 @@ def middle_ear_fir(model: str, sample_rate: float, unity: bool) -> FloatArray:
     nyquist = sample_rate / 2
     lowest = {"jepsen": STAPES_IMPEDANCE[0, 0], "lopezpoveda": STAPES_VELOCITY_EXTRAPOLATED[0, 0]}[model]
     if nyquist <= lowest:
-        raise ValueError(f"pp_middleEarModel: {model} requires a sample rate above {2 * lowest:.12g} Hz")
+        raise ValueError(
+            f"pp_middleEarModel: expected a sample rate above {2 * lowest:.12g} Hz for {model}, got "
+            f"{sample_rate:.12g} Hz"
+        )
     fir = _jepsen(nyquist) if model == "jepsen" else _lopezpoveda(nyquist)
     return fir * 10 ** (PEAK_DB[model] / 20) if unity else fir
 

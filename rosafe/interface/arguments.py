@@ -38,10 +38,15 @@ def check_change(name: Any, value: Any) -> tuple[str, Any]:
     return check_parameter(name, value)
 
 
+def is_parameter(name: Any) -> bool:
+    """Return whether a parameter has this name or alias."""
+    return isinstance(name, str) and name in _BY_NAME
+
+
 def _parameter(name: Any) -> Parameter:
-    if not isinstance(name, str) or name not in _BY_NAME:
+    if not is_parameter(name):
         known = list(dict.fromkeys(p.name for kind in KINDS.values() for p in kind.parameters))
-        raise ValueError(f"unknown parameter {short_repr(name)}; {_suggestion(name, known)}")
+        raise ValueError(f"parameters: expected a known parameter, got {short_repr(name)}; {_suggestion(name, known)}")
     return _BY_NAME[name]
 
 
@@ -61,7 +66,9 @@ def check_outputs(outputs: Any) -> list[str]:
         raise ValueError(f"outputs: expected a sequence of names, got {outputs!r}") from None
     for name in requested:
         if not isinstance(name, str) or name not in KINDS:
-            raise ValueError(f"unknown output {short_repr(name)}; {_suggestion(name, list(KINDS))}")
+            raise ValueError(
+                f"outputs: expected a known output, got {short_repr(name)}; {_suggestion(name, list(KINDS))}"
+            )
     if not requested:
         raise ValueError("outputs: expected at least one name, got none")
     return [kind for kind in KINDS if kind in requested]

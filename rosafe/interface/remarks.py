@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from rosafe.interface import KINDS
-from rosafe.interface.arguments import check_parameter
+from rosafe.interface.arguments import is_parameter
 
 # Parameters for a purpose, by name. docs/parameters.md describes how they were measured.
 PRESETS: dict[str, dict[str, Any]] = {
@@ -57,10 +57,5 @@ def rate_advice(problem: ValueError, sample_rate: float) -> ValueError:
 
 def unknown_argument(name: str, function: str = "process") -> TypeError:
     """Return the error for an unknown keyword argument; parameters belong to `parameters`."""
-    text = f"{function}() got an unexpected keyword argument {name!r}"
-    try:
-        name, _ = check_parameter(name, None)
-    except ValueError as problem:
-        if str(problem).startswith("unknown parameter"):
-            return TypeError(text)
-    return TypeError(f"{text}; pass parameters as parameters={{{name!r}: ...}}")
+    advice = f"; pass parameters as parameters={{{name!r}: ...}}" if is_parameter(name) else ""
+    return TypeError(f"{function}() got an unexpected keyword argument {name!r}{advice}")

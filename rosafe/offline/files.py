@@ -120,7 +120,7 @@ def process_file(
     one_ear = outputs is not None and not any(KINDS[kind].binaural for kind in kinds)
     with closing(open_sound(source, channels, topic, one_ear, clip, _MONO_ADVICE)) as sound:
         if os.path.exists(target) and os.path.samefile(sound.path, target):
-            raise OutputError(f"{target} is the input file")
+            raise OutputError(f"{target}: expected another file than the input, got the same")
         if sound.floats:
             values.setdefault("in_doNormalize", False)
         with new_output(file_format, target, replace) as path:
@@ -153,7 +153,9 @@ def _complete(
     except ValueError:
         if file_format.is_one(target):
             return False
-        raise OutputError(f"{target} is not a result of rosafe process; --force replaces it") from None
+        raise OutputError(
+            f"{target}: expected a result of rosafe process, got another file; --force replaces it"
+        ) from None
     except OSError as problem:
         raise OutputError(f"{target}: {problem.strerror or problem}") from None
     names = {name for kind in kinds for name in KINDS[kind].outputs}
@@ -221,7 +223,7 @@ class _FileRun:
             block = sound.read(count)
             if block.shape[1] != count:
                 raise AudioFileError(
-                    f"{sound.path} is truncated: expected {sound.frames} frames, got {first + block.shape[1]}"
+                    f"{sound.path}: expected {sound.frames} frames, got {first + block.shape[1]}; the file is truncated"
                 )
             yield np.broadcast_to(block, (ears, count))
         for first in range(0, self._padding, length):

@@ -144,7 +144,7 @@ def load(path: str | os.PathLike[str]) -> Result:
     try:
         _check_arrays(result)
     except ValueError as problem:
-        raise ValueError(f"{path} is damaged: {problem}") from None
+        raise ValueError(f"{path}: expected a result of rosafe process, got a damaged one: {problem}") from None
     for kind in KINDS.values():  # times of samples are not stored
         stored = [name for name in kind.outputs if name in result["axes"]]
         if stored and f"{kind.kind}_time" not in result:
@@ -253,8 +253,10 @@ def read(file_format: Format, path: Path, arrays: bool = True) -> dict[str, Any]
     try:
         result = checked(file_format.read(path, arrays))
     except (ValueError, OverflowError, RecursionError, MemoryError) as problem:  # json.JSONDecodeError, too
-        raise ValueError(f"{path} is not a result of rosafe process, or damaged: {problem}") from None
+        raise ValueError(
+            f"{path}: expected a result of rosafe process, got another or damaged file: {problem}"
+        ) from None
     for name in ("axes", "parameters", "sample_rate"):
         if name not in result:
-            raise ValueError(f"{path} is not a result of rosafe process: it lacks {name}")
+            raise ValueError(f"{path}: expected a result of rosafe process, got a file without {name}")
     return result

@@ -122,7 +122,9 @@ def outputs_of(ears: int, outputs: Any) -> list[str]:
     checked = check_outputs(outputs)
     binaural = [kind for kind in checked if KINDS[kind].binaural]
     if ears == 1 and binaural:
-        raise ValueError(f"outputs: {', '.join(binaural)} compare two ears, and the signal has one")
+        raise ValueError(
+            f"outputs: expected representations of single ears for a signal with one ear, got {', '.join(binaural)}"
+        )
     return checked
 
 

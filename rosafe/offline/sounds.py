@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from rosafe.sound.audiofile import AudioFile, AudioFileError
+from rosafe.sound.audiofile import AudioFile, AudioFileError, channels_text
 from rosafe.sound.bagsound import BagSoundError, Recording, from_first_samples
 
 BAG = ".bag"
@@ -81,9 +81,9 @@ def open_sound(
         if channels is not None:
             file.pick(channels)
         if file.channels != 2 and not (one_ear and file.channels == 1):
-            kind = "is mono (one channel)" if file.channels == 1 else f"has {file.channels} channels"
             advice = mono_advice if file.channels == 1 else "--channels 1,2 takes the first two"
-            raise AudioFileError(f"{file.path} {kind}; expected two, left and right ear ({advice})")
+            kind = channels_text(file.channels)
+            raise AudioFileError(f"{file.path}: expected two channels, left and right ear, got {kind}; {advice}")
     except AudioFileError:
         file.close()
         raise
@@ -126,7 +126,7 @@ class BagSound:
             for number, (sample_rate, pieces) in enumerate(self._recording.streams(), 1):
                 if number > 1:
                     raise AudioFileError(
-                        f"{self.path} contains several successive streams of sound; extract one with "
+                        f"{self.path}: expected one stream of sound, got several successive ones; extract one with "
                         f"`rosafe record OUT.wav --device 'bag:{self.path}?stream=2'`"
                     )
                 self.sample_rate = sample_rate
@@ -134,7 +134,7 @@ class BagSound:
         except BagSoundError as problem:
             raise AudioFileError(str(problem)) from None
         if not self.frames:
-            raise AudioFileError(f"{self.path} contains no sound on {self._recording.topic}")
+            raise AudioFileError(f"{self.path}: expected sound on {self._recording.topic}, got none")
 
     def _from_start(self) -> Iterator[np.ndarray]:
         (_, pieces), *_ = islice(self._recording.streams(), 1)

@@ -157,7 +157,7 @@ class Adaptation(Stage):
         threshold = np.array([values["adpt_mindB"]])
         if values["adpt_model"] == TERHARDT:
             if not self.input_format.center_frequencies:
-                raise ValueError(f"adpt_model: {TERHARDT} requires channels of known frequencies")
+                raise ValueError(f"adpt_model: expected channels of known frequencies for {TERHARDT}, got none")
             threshold = np.minimum(hearing_threshold(np.array(self.input_format.center_frequencies)), MAX_THRESHOLD_DB)
         self._loops = Loops.design(
             self.sample_rate,

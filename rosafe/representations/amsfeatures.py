@@ -233,14 +233,15 @@ class AmsFeatures(FramedStage):
         if values["ams_fbType"] == "lin":
             if values["ams_highFreqHz"] > rate / 2:
                 raise ValueError(
-                    f"ams_highFreqHz: expected at most half of {rate:.12g} Hz, the sample rate after ams_dsRatio"
+                    f"ams_highFreqHz: expected at most half of {rate:.12g} Hz, the sample rate after ams_dsRatio, got "
+                    f"{values['ams_highFreqHz']:.12g} Hz"
                 )
             triangles = design_triangles(frequencies, values, rate, transform_points(len(framing.window)))
         elif UPPER * frequencies.max() >= rate / 2:
             name = "ams_cfHz" if values["ams_cfHz"] else "ams_highFreqHz"
             raise ValueError(
-                f"{name}: a filter at {frequencies.max():.12g} Hz requires a sample rate above"
-                f" {2 * UPPER * frequencies.max():.6g} Hz after ams_dsRatio, got {rate:.12g} Hz"
+                f"{name}: expected a sample rate above {2 * UPPER * frequencies.max():.6g} Hz after ams_dsRatio for a "
+                f"filter at {frequencies.max():.12g} Hz, got {rate:.12g} Hz"
             )
         else:
             sections = design_sections(frequencies, rate)

@@ -124,7 +124,10 @@ class InnerHairCell(Stage):
         if method in LOWPASS:
             order, cutoff, times = LOWPASS[method]
             if cutoff >= self.sample_rate / 2:
-                raise ValueError(f"ihc_method: {method} requires a sample rate above {2 * cutoff:.12g} Hz")
+                raise ValueError(
+                    f"ihc_method: expected a sample rate above {2 * cutoff:.12g} Hz for {method}, got "
+                    f"{self.sample_rate:.12g} Hz"
+                )
             sections = np.tile(scipy.signal.butter(order, cutoff, fs=self.sample_rate, output="sos"), (times, 1))
         self._lowpass = SosFilter(sections)
 

@@ -21,6 +21,11 @@ class AudioFileError(Exception):
     """The file cannot be read; the text is one line with the reason."""
 
 
+def channels_text(count: int) -> str:
+    """Return a number of channels for an error message."""
+    return "1 (the file is mono)" if count == 1 else str(count)
+
+
 def to_int32(signal: np.ndarray) -> np.ndarray:
     """Convert float samples (full scale 1.0) to int32: scaled by 2^31 - 1, rounded, clipped; NaN becomes 0."""
     return _rounded(signal)[0]
@@ -84,13 +89,13 @@ class AudioFile:
             raise AudioFileError(f"{self.path}: {getattr(problem, 'strerror', None) or problem}") from None
         if not os.fstat(descriptor).st_size:
             os.close(descriptor)
-            raise AudioFileError(f"{self.path} is empty")
+            raise AudioFileError(f"{self.path}: expected a sound file, got an empty file")
         try:
             # If it got the name, libsndfile would also open resource forks, and accept any file as .gsm or .vox.
             self._file = soundfile.SoundFile(descriptor)
         except soundfile.LibsndfileError as problem:
             raise AudioFileError(
-                f"{self.path} is not a sound file: {problem.error_string}{self._mp3_advice()}"
+                f"{self.path}: expected a sound file, got another file: {problem.error_string}{self._mp3_advice()}"
             ) from None
         self.not_finite = self.clipped = 0
         self.sample_rate = int(self._file.samplerate)
@@ -105,6 +110,10 @@ class AudioFile:
             self.close()
             raise
 
+    def _damaged(self, problem: soundfile.LibsndfileError) -> AudioFileError:
+        reason = f"got a truncated or damaged one: {problem.error_string}"
+        return AudioFileError(f"{self.path}: expected a complete sound file, {reason}")
+
     def _mp3_advice(self) -> str:
         """Return advice if the file is an MP3 and this version of libsndfile cannot read MP3; otherwise ''."""
         if self.path.suffix.lower() != ".mp3" or "MP3" in soundfile.available_formats():
@@ -114,22 +123,23 @@ class AudioFile:
 
     def _check_complete(self) -> None:
         if self.frames == 0:
-            raise AudioFileError(f"{self.path} contains no samples")
+            raise AudioFileError(f"{self.path}: expected samples, got none")
         # libsndfile silently shortens a truncated WAV or AIFF; only its log shows that bytes are missing.
         cut = re.search(r"^\s*(?:data|SSND)\s*:\s*(\d+) \(should be (\d+)\)", self._file.extra_info, re.MULTILINE)
         if cut and int(cut[2]) < int(cut[1]) < _UNKNOWN_LENGTH:
-            raise AudioFileError(f"{self.path} is truncated: it contains {cut[2]} of {cut[1]} bytes of sound")
+            raise AudioFileError(f"{self.path}: expected {cut[1]} bytes of sound, got {cut[2]}; the file is truncated")
         self.seek(self.frames - 1)  # fails for a truncated compressed file
         if self.read(1).shape[1] != 1:
-            raise AudioFileError(f"{self.path} is truncated: it contains fewer than {self.frames} frames")
+            raise AudioFileError(f"{self.path}: expected {self.frames} frames, got fewer; the file is truncated")
         self.seek(0)
         self.not_finite = self.clipped = 0  # the last frame was read above
 
     def pick(self, ears: tuple[int, int]) -> None:
         """Select two channels (from 1, may be equal) for `read`. Raises AudioFileError if one does not exist."""
         if max(ears) > self.channels:
-            size = "is mono" if self.channels == 1 else f"has {self.channels} channels"
-            raise AudioFileError(f"{self.path} {size}: there is no channel {max(ears)}")
+            raise AudioFileError(
+                f"{self.path}: expected a file with channel {max(ears)}, got {channels_text(self.channels)}"
+            )
         self._ears = [ear - 1 for ear in ears]
         self.channels = 2
 
@@ -138,7 +148,7 @@ class AudioFile:
         try:
             self._file.seek(frame)
         except soundfile.LibsndfileError as problem:
-            raise AudioFileError(f"{self.path} is truncated or damaged: {problem.error_string}") from None
+            raise self._damaged(problem) from None
 
     def read(self, frames: int) -> np.ndarray:
         """Return the next `frames` frames, fewer at the end of the file.
@@ -151,7 +161,7 @@ class AudioFile:
         try:
             samples = self._file.read(frames, dtype="float64" if self._float else "int32", always_2d=True).T
         except soundfile.LibsndfileError as problem:
-            raise AudioFileError(f"{self.path} is truncated or damaged: {problem.error_string}") from None
+            raise self._damaged(problem) from None
         if self._ears is not None:
             samples = samples[self._ears]
         if self._float:

@@ -19,6 +19,7 @@ TYPE = "binaudio_portStruct"  # of the port Audio, in the package bass or anothe
 MD5SUM = "a3b73b6f3547870cf712571c1a85ea1d"
 MAX_MESSAGE = 2 * 4 * MAX_WINDOW + 1024  # bytes: the samples of both ears, and the other fields
 MAX_LISTED = 20  # topics in an error message
+_EXPECTED = "expected a complete bag of format 2.0, got one that"
 _HEAD, _LENGTH, _STAMP = struct.Struct("<3IQ"), struct.Struct("<I"), 8
 Piece = tuple[int, np.ndarray]  # number of frames lost before the samples, and the samples, int32 (2, n)
 
@@ -91,10 +92,11 @@ class Recording:
             raise BagSoundError(f"{path}: {getattr(problem, 'strerror', None) or problem}") from None
         except NotClosedError:
             raise BagSoundError(
-                f"{path} was not closed by its recorder, or is truncated; repair it with `rosbag reindex {path}`"
+                f"{path}: expected a complete bag, got one that was not closed by its recorder, or is truncated; "
+                f"repair it with `rosbag reindex {path}`"
             ) from None
         except BagError as problem:
-            raise BagSoundError(f"{path} {problem}") from None
+            raise BagSoundError(f"{path}: {_EXPECTED} {problem}") from None
         try:
             types = {connection.topic: connection.type for connection in self._bag.connections.values()}
             ports = sorted(name for name, kind in types.items() if kind.endswith(f"/{TYPE}"))
@@ -110,7 +112,7 @@ class Recording:
         if topic in types:
             raise BagSoundError(f"{self._path}: expected {topic} to be a port Audio, got type {types[topic]}")
         topics = ", ".join((ports or sorted(types))[:MAX_LISTED]) or "none"
-        raise BagSoundError(f"{self._path}: does not contain the topic {topic}; available: {topics}")
+        raise BagSoundError(f"{self._path}: expected the topic {topic}, got {topics}")
 
     def _only_port(self, ports: list[str], default: str, advice: str) -> str:
         """Return the only one of the `ports`, or `default` if it is one of several. Raises BagSoundError."""
@@ -119,8 +121,10 @@ class Recording:
         if default in ports:
             return default
         if not ports:
-            raise BagSoundError(f"{self._path} contains no port Audio (type bass/{TYPE})")
-        raise BagSoundError(f"{self._path} contains several ports Audio; {advice}: {', '.join(ports[:MAX_LISTED])}")
+            raise BagSoundError(f"{self._path}: expected a port Audio (type bass/{TYPE}), got none")
+        raise BagSoundError(
+            f"{self._path}: expected one port Audio, got several; {advice}: {', '.join(ports[:MAX_LISTED])}"
+        )
 
     def streams(self) -> Iterator[tuple[int, Iterator[Piece]]]:
         """Yield the sample rate (Hz) and the pieces of each stream; read the pieces before the next stream.
@@ -161,9 +165,9 @@ class Recording:
                     raise BagSoundError(f"{self._path}: {self.topic}: expected md5sum {MD5SUM}, got {md5sum}")
                 yield _decode(data)
         except BagError as problem:
-            raise BagSoundError(f"{self._path} {problem}") from None
+            raise BagSoundError(f"{self._path}: {_EXPECTED} {problem}") from None
         except (struct.error, OSError, ValueError) as problem:
-            raise BagSoundError(f"{self._path} is damaged: {problem}") from None
+            raise BagSoundError(f"{self._path}: {_EXPECTED} is damaged: {problem}") from None
 
     def close(self) -> None:
         """Close the bag."""

@@ -136,8 +136,8 @@ def test_topics(tmp_path: Path) -> None:
         bag.write("/text", String("hello"))
     assert np.array_equal(play(open_bag(tmp_path / "a.bag", "?topic=/right/Audio")), right)
     for option, why in (
-        ("", "contains several ports Audio; choose one with ?topic=: /left/Audio, /right/Audio"),
-        ("?topic=/bass/Audio", "does not contain the topic /bass/Audio; available: /left/Audio, /right/Audio"),
+        ("", "expected one port Audio, got several; choose one with ?topic=: /left/Audio, /right/Audio"),
+        ("?topic=/bass/Audio", "expected the topic /bass/Audio, got /left/Audio, /right/Audio"),
         ("?topic=/text", "expected /text to be a port Audio, got type std_msgs/String"),
         ("?topic=", "topic: expected a topic"),
     ):
@@ -182,8 +182,8 @@ def bad_bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("version.bag", "e_device", "is not a bag of format 2.0"),
         ("header.bag", "e_device", "truncated; repair it with `rosbag reindex header.bag`"),
         ("cut.bag", "e_device", "was not closed by its recorder, or is truncated"),
-        ("empty.bag", "e_device", "contains no port Audio"),
-        ("text.bag", "e_device", "contains no port Audio"),
+        ("empty.bag", "e_device", "expected a port Audio (type bass/binaudio_portStruct), got none"),
+        ("text.bag", "e_device", "expected a port Audio (type bass/binaudio_portStruct), got none"),
         ("nothing.bag", "e_device", "expected a start within the stream"),
         ("uneven.bag", "e_device", "40 left and 39 right samples"),
         ("good.bag?start=3", "e_device", "expected a start within"),
@@ -208,6 +208,9 @@ def test_unusable_bags_are_rejected(
 
 def test_damage_in_the_middle_ends_the_source_with_an_error(bad_bags: Path) -> None:
     source = open_bag(bad_bags / "damaged.bag")
-    with pytest.raises(ComponentError, match=r"damaged\.bag is damaged: 1000000000 samples do not fit") as caught:
+    with pytest.raises(
+        ComponentError,
+        match=r"damaged\.bag: expected a complete bag of format 2\.0, got one that is damaged: 1000000000 samples",
+    ) as caught:
         play(source)
     assert caught.value.ex == "::bass::e_device"

@@ -140,9 +140,9 @@ def window_of_wrong_length(folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("make", "why"),
     [
-        (zeros, "a.bag is not a bag of format 2.0"),
+        (zeros, "a.bag: expected a complete bag of format 2.0, got one that is not a bag of format 2.0"),
         (magic_and_zeros, "was not closed by its recorder, or is truncated"),
-        (older_format, "a.bag is not a bag of format 2.0"),
+        (older_format, "a.bag: expected a complete bag of format 2.0, got one that is not a bag of format 2.0"),
         (long_header, "was not closed by its recorder, or is truncated"),
         (many_connections, "expected at most 10000 connections, got 4294967295"),
         (long_message, "is damaged: expected a field of at most 134218752 bytes, got 3221225472"),

@@ -239,8 +239,11 @@ def test_failures_are_listed_and_the_others_are_processed(tmp_path: Path) -> Non
     summary, *lines = done.stderr.splitlines()
     assert summary.startswith("8 files: 4 done, 4 failed; ")
     assert [line.split(" ", 4)[:3] for line in lines] == [["rosafe", "process:", line.split()[2]] for line in lines]
-    assert lines[0] == "rosafe process: corpus/empty.wav is empty"
-    assert any("new\\nline.wav is mono" in line for line in lines) and "none.wav contains no samples" in done.stderr
+    assert lines[0] == "rosafe process: corpus/empty.wav: expected a sound file, got an empty file"
+    assert (
+        any("new\\nline.wav: expected two channels" in line for line in lines)
+        and "none.wav: expected samples, got none" in done.stderr
+    )
     assert len(failed(tmp_path / "out")) == 4 and "corpus/new\nline.wav" in failed(tmp_path / "out")
     assert_results(tmp_path / "out", sounds)
     for bad in ("none.wav", "new\nline.wav", os.fsdecode(b"\xff.wav")):

@@ -30,8 +30,8 @@ def assert_untouched(folder: Path, *others: str) -> None:
     ("content", "words"),
     [
         (b"", ["is empty"]),
-        (b"no sound at all " * 50, ["is not a sound file"]),
-        (b"RIFF\xff\xff\xff\xffWAVE", ["not a sound file"]),
+        (b"no sound at all " * 50, ["bad.wav: expected a sound file, got another file: "]),
+        (b"RIFF\xff\xff\xff\xffWAVE", ["bad.wav: expected a sound file, got another file"]),
     ],
 )
 def test_other_files_than_sounds(folder: Path, content: bytes, words: list[str]) -> None:
@@ -49,7 +49,7 @@ def test_other_than_two_channels(folder: Path, channels: int) -> None:
 
 def test_no_samples(folder: Path) -> None:
     write(folder / "bad.wav", np.zeros((2, 0)))
-    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav contains no samples")
+    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav: expected samples, got none")
     assert_untouched(folder, "bad.wav")
 
 
@@ -84,7 +84,7 @@ def test_missing_folder_and_unreadable(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        ("fb_nChanels=64", ["unknown parameter 'fb_nChanels'", "fb_nChannels"]),
+        ("fb_nChanels=64", ["parameters: expected a known parameter, got 'fb_nChanels'", "fb_nChannels"]),
         ("fb_nChannels=", ["fb_nChannels", "whole number"]),
         ("fb_nChannels=-3", ["fb_nChannels"]),
         ("fb_nChannels=2.5", ["fb_nChannels", "whole number"]),
@@ -107,13 +107,13 @@ def test_parameters(folder: Path, setting: str, words: list[str]) -> None:
 
 def test_a_parameter_given_twice(folder: Path) -> None:
     settings = ["--set", "fb_nChannels=4", "--set", "fb_nChannels=8"]
-    refused(rosafe("process", "in.wav", *settings, cwd=folder), "fb_nChannels is given twice")
+    refused(rosafe("process", "in.wav", *settings, cwd=folder), "fb_nChannels: expected one value, got two")
     assert_untouched(folder)
 
 
 @pytest.mark.parametrize("outputs", ["ild,rms", "", "ILD", "ild,,ratemap"])
 def test_outputs(folder: Path, outputs: str) -> None:
-    refused(rosafe("process", "in.wav", "--outputs", outputs, cwd=folder), "unknown output")
+    refused(rosafe("process", "in.wav", "--outputs", outputs, cwd=folder), "outputs: expected a known output, got ")
     assert_untouched(folder)
 
 

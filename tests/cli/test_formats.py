@@ -196,16 +196,16 @@ def test_damaged_files_and_other_files(tmp_path: Path, sound: Path, extension: s
     if extension != ".zarr":
         for content in (b"", b"something else " * 100):
             target.write_bytes(content)
-            with pytest.raises(ValueError, match="is not a result of rosafe process"):
+            with pytest.raises(ValueError, match="expected a result of rosafe process, got "):
                 rosafe.load(target)
         process_file(sound, target, SMALL_PARAMETERS, outputs=["ild"], replace=True)
         whole_file = target.read_bytes()
         target.write_bytes(whole_file[: len(whole_file) // 2])
-        with pytest.raises(ValueError, match="is not a result of rosafe process, or damaged"):
+        with pytest.raises(ValueError, match="expected a result of rosafe process, got another or damaged file"):
             rosafe.load(target)
     else:
         target.mkdir()
-        with pytest.raises(ValueError, match="is not a result of rosafe process"):
+        with pytest.raises(ValueError, match="expected a result of rosafe process, got "):
             rosafe.load(target)
     with pytest.raises(ValueError, match=r"a\.txt: expected a name that ends in \.npz, \.h5"):
         rosafe.load(tmp_path / "a.txt")
@@ -233,7 +233,7 @@ def test_resume(tmp_path: Path, sound: Path, extension: str) -> None:
     assert not resume(SMALL_PARAMETERS).skipped
     assert_same(rosafe.load(target), before)
     target.write_text("foreign text")
-    with pytest.raises(OutputError, match="is not a result of rosafe process; --force replaces it"):
+    with pytest.raises(OutputError, match="expected a result of rosafe process, got another file; --force replaces it"):
         resume(SMALL_PARAMETERS)
     assert target.read_text() == "foreign text"
 
@@ -295,9 +295,12 @@ def test_channels(tmp_path: Path) -> None:
         loaded = rosafe.load(tmp_path / "out.npz")
         assert_same(loaded, expected)
         assert loaded["channels"] == [left + 1, right + 1]
-    refused(command("process", "mono.wav", "--channels", "1,2", cwd=tmp_path), "is mono: there is no channel 2")
+    refused(
+        command("process", "mono.wav", "--channels", "1,2", cwd=tmp_path),
+        "mono.wav: expected a file with channel 2, got 1 (the file is mono)",
+    )
     refused(command("process", "five.wav", cwd=tmp_path), "has 5 channels", "--channels 1,2 takes the first two")
-    refused(command("process", "mono.wav", cwd=tmp_path), "is mono", "--channels 1,1 uses it for both")
+    refused(command("process", "mono.wav", cwd=tmp_path), "is mono)", "--channels 1,1 uses it for both")
 
 
 def test_nan_and_infinite_samples_are_reported(tmp_path: Path) -> None:
@@ -330,7 +333,7 @@ def test_bags(tmp_path: Path) -> None:
     for name in ("a", "left"):
         assert_same(rosafe.load(tmp_path / f"{name}.npz"), expected)
     done = command("process", "left.bag", *options, "--topic", "/bass/Audio", "-o", "b.npz", cwd=tmp_path)
-    refused(done, "left.bag: does not contain the topic /bass/Audio; available: /left/Audio")
+    refused(done, "left.bag: expected the topic /bass/Audio, got /left/Audio")
     done = command("process", "a.bag", *options, "--channels", "2,1", "-o", "b.h5", cwd=tmp_path)
     assert done.returncode == 0
     np.testing.assert_array_equal(rosafe.load(tmp_path / "b.h5")["input"], expected["input"][::-1])
@@ -342,7 +345,7 @@ def test_a_bag_with_several_streams(tmp_path: Path) -> None:
     bags.write(tmp_path / "a.bag", both)
     refused(
         command("process", "a.bag", *SMALL, cwd=tmp_path),
-        "a.bag contains several successive streams",
+        "a.bag: expected one stream of sound, got several successive ones",
         "rosafe record OUT.wav",
     )
     (tmp_path / "cut.bag").write_bytes((tmp_path / "a.bag").read_bytes()[:3000])

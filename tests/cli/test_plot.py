@@ -63,18 +63,24 @@ def test_existing_pictures_are_kept(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["sound.wav", "--outputs", "speech"], ["unknown output 'speech'"]),
+        (["sound.wav", "--outputs", "speech"], ["outputs: expected a known output, got 'speech'"]),
         (["sound.wav", "--set", "fb_nChannels=-1"], ["fb_nChannels"]),
         (["sound.wav", "--set", "fb_highFreqHz=8000"], ["fb_highFreqHz", "use at most 3800 Hz"]),
-        (["mono.wav", "--outputs", "ild"], ["ild compare two ears, and the signal has one"]),
+        (
+            ["mono.wav", "--outputs", "ild"],
+            ["outputs: expected representations of single ears for a signal with one ear, got ild"],
+        ),
         (["three.wav"], ["expected one or two channels, got 3", "--channels"]),
         (["mono.wav", "-o", "sound.pdf"], ["-o: expected a name ending in .png, got sound.pdf"]),
         (["mono.wav", "-o", "ratemap"], ["-o: expected a name ending in .png, got ratemap"]),
         (["nothing.wav"], ["nothing.wav"]),
         (["nothing.npz"], ["nothing.npz: No such file or directory"]),
-        (["text.npz"], ["text.npz is not a result of rosafe process"]),
-        (["other.npz"], ["other.npz is not a result of rosafe process"]),
-        (["other.npz", "--set", "fb_nChannels=3"], ["--set: a result already has its parameters"]),
+        (["text.npz"], ["text.npz: expected a result of rosafe process, got another or damaged file"]),
+        (["other.npz"], ["other.npz: expected a result of rosafe process, got a"]),
+        (
+            ["other.npz", "--set", "fb_nChannels=3"],
+            ["--set: expected a sound, got a result, which already has its parameters"],
+        ),
         (["result.npz", "--outputs", "itd"], ["outputs: expected outputs of the result", "got 'itd'"]),
     ],
 )

@@ -203,7 +203,9 @@ def test_the_others_are_processed_after_a_faulty_file(tmp_path: Path) -> None:
     write(tmp_path / "c.wav", noise(3000))
     done = rosafe("process", "a.wav", "b.wav", "c.wav", "-q", *SMALL, cwd=tmp_path)
     assert done.returncode == 1
-    assert done.stderr.startswith("rosafe process: b.wav is mono (one channel); expected two, left and right ear")
+    assert done.stderr.startswith(
+        "rosafe process: b.wav: expected two channels, left and right ear, got 1 (the file is mono)"
+    )
     assert done.stderr.count("\n") == 1
     assert {path.name for path in tmp_path.glob("*.npz")} == {"a.npz", "c.npz"}
 

@@ -150,7 +150,10 @@ def test_exceptions_of_the_component(world: World) -> None:
 
 
 def test_rejected_arguments_are_not_sent_to_a_component(world: World) -> None:
-    for given, reported in (({"bogus": 1}, "unknown parameter 'bogus'"), ({"name": 7}, "name is a string")):
+    for given, reported in (
+        ({"bogus": 1}, "expected a known parameter, got 'bogus'"),
+        ({"name": 7}, "name is a string"),
+    ):
         for verb in ("call", "send"):
             with pytest.raises(HttpError, match=reported) as caught:
                 world.http.get(f"/{verb}/rosAFE/PreProc", given)

@@ -195,9 +195,9 @@ def test_the_result_of_one_call_is_the_argument_of_another(world: World) -> None
     [
         (
             "GammatoneProc {name g bogus 1}",
-            "unknown parameter 'bogus'; GammatoneProc takes name (string), upperDepName",
+            "GammatoneProc: expected a known parameter, got 'bogus'; GammatoneProc takes name (string), upperDepName",
         ),
-        ("GammatoneProc {bogus 1}", "unknown parameter 'bogus'"),
+        ("GammatoneProc {bogus 1}", "GammatoneProc: expected a known parameter, got 'bogus'"),
         (
             "GammatoneProc {fb_nERBs abc}",
             "fb_nERBs: expected a finite number, got 'abc' (fb_nERBs is a double; above 0, at most 100)",

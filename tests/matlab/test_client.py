@@ -98,9 +98,9 @@ def test_components_and_errors(world: World) -> None:
     assert results["refused"] == ["error", "::rosAFE::e_noSuchProcessor", True]
     assert results["wrong"][:2] == ["error", "::genom::serialization"] and "nFramesPerBlock" in results["wrong"][2]
     assert results["acknowledged"] == ["error", "::rosAFE::e_noUpperDependencie"]
-    assert results["many"].startswith("5 arguments are too many; InputProc takes name (string)")
+    assert results["many"].startswith("InputProc: expected at most 4 arguments, got 5; InputProc takes name (string)")
     assert results["kind"] == ["error", "::genom::serialization"]
-    assert results["name"].startswith("unknown parameter 'fb_nERB'")
+    assert results["name"].startswith("GammatoneProc: expected a known parameter, got 'fb_nERB'")
     assert results["port"][:3] == ["genomix.request", "error", "::genom::no_such_outport"]
     assert results["port"][3] == "ildPort has no element 'missing'; there are: none"
     assert results["cells"] == ["error", "error"]

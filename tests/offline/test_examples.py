@@ -78,7 +78,7 @@ def test_the_tutorial(folder: Path) -> None:
     assert min(azimuths) < -30 and max(azimuths) > 30  # both sides
     assert f"16000.0 {rosafe.__version__} 8000.0" in said
     assert "(2, 62, 1000) [(2, 31, 999), (2, 31, 49)]" in said
-    assert "unknown parameter 'fb_nChanels'; did you mean fb_nChannels?" in said
+    assert "expected a known parameter, got 'fb_nChanels'; did you mean fb_nChannels?" in said
     assert "('channel', 'time') Hz" in said and "(32, 1) [9.99]" in said
     assert is_picture(folder / "speech.png") and is_picture(folder / "ears.png")
 

@@ -203,6 +203,17 @@ def test_unknown_choices_are_replaced(afe: Session) -> None:
     assert parameters.ratemap[0].rm_scaling == "power"
 
 
+def test_a_window_too_short_for_the_pitch_range_is_logged_once(afe: Session) -> None:
+    line = "pitch: pi_rangeHz, ac_wSizeSec: a window of 0.02 s contains fewer than 3 periods of 80 Hz"
+    before = afe.process.err.count(line)
+    afe.build("PreProc", "GammatoneProc", "IhcProc", "AutocorrelationProc", "PitchProc", fb_nChannels=2)
+    wait_for(lambda: afe.process.err.count(line) == before + 1, what=lambda: afe.process.err)
+    afe.ok("modifyParameter", nameProc="pitch", nameParam="pi_medianOrder", newValue="5")
+    afe.ok("AutocorrelationProc", name="long", upperDepName="ihc", ac_wSizeSec=0.04)
+    afe.ok("PitchProc", name="voices", upperDepName="long")
+    assert afe.process.err.count("pi_rangeHz, ac_wSizeSec") == before + 1
+
+
 def test_a_list_of_one_zero_is_the_default(afe: Session) -> None:
     afe.build("PreProc")
     afe.ok("GammatoneProc", fb_cfHz=[0.0], fb_nChannels=3)

@@ -379,14 +379,15 @@ class Transform(NamedTuple):
 def gabor_responses(
     levels: FloatArray, count: int, reach: int, places: NDArray[np.int64], weights: FloatArray
 ) -> FloatArray:
-    """Compute the same as `rosafe.representations.gabor.respond_by_scipy`. Two ears take as long as one."""
+    """Compute the same as `rosafe.representations.gabor.respond_by_scipy`."""
     ears, channels, length = levels.shape
     frames = -(-count // MAX_LANES) * MAX_LANES
-    padded = np.zeros((2, channels, frames + 2 * reach))
-    padded[:ears, :, :length] = levels
-    sums = np.empty((2, len(places), frames))
+    padded = np.zeros((ears, channels, frames + 2 * reach))
+    padded[:, :, :length] = levels
+    sums = np.empty((ears, len(places), frames))
     _function("rosafe_gabor_responses")(
         _address(padded),
+        ears,
         channels,
         frames,
         reach,
@@ -394,7 +395,7 @@ def gabor_responses(
         len(places),
         *map(_address, (weights, sums)),
     )
-    return sums[:ears, :, :count]
+    return sums[:, :, :count]
 
 
 def concatenate(blocks: Sequence[FloatArray], whole: FloatArray) -> None:

@@ -26,7 +26,7 @@ _ARGUMENTS = {
     "rosafe_level_differences": (_FRAMES, _REAL, _ARRAY, _ARRAY),
     "rosafe_ratemap": (_FRAMES, _INTEGER, _REAL, _ARRAY, _ARRAY),
     "rosafe_modulation": (_FRAMES, _INTEGER, *[_ARRAY] * 3),
-    "rosafe_gabor_responses": (_ARRAY, *[_INTEGER] * 3, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
+    "rosafe_gabor_responses": (_ARRAY, *[_INTEGER] * 4, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_concatenate": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _ARRAY, _INTEGER),
     "rosafe_mixture": (_INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_add_evidence": (_CUES, _REAL, _ARRAY, _INTEGER, _ARRAY, _REAL, _ARRAY),
