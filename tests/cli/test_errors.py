@@ -29,7 +29,7 @@ def assert_untouched(folder: Path, *others: str) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"", ["is empty"]),
+        (b"", ["bad.wav: expected a sound file, got an empty file"]),
         (b"no sound at all " * 50, ["bad.wav: expected a sound file, got another file: "]),
         (b"RIFF\xff\xff\xff\xffWAVE", ["bad.wav: expected a sound file, got another file"]),
     ],
@@ -43,7 +43,7 @@ def test_other_files_than_sounds(folder: Path, content: bytes, words: list[str])
 @pytest.mark.parametrize("channels", [1, 3, 8])
 def test_other_than_two_channels(folder: Path, channels: int) -> None:
     write(folder / "bad.wav", np.zeros((channels, 500)))
-    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav", "two, left and right ear")
+    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav", "two channels, left and right ear")
     assert_untouched(folder, "bad.wav")
 
 
@@ -178,7 +178,7 @@ def test_unwritable_outputs(folder: Path) -> None:
         "out.wav": ["-o: expected a name ending in .npz"],
         "in.wav/out.npz": ["in.wav/out.npz", "Not a directory"],
         "in.wav": ["-o: expected a name ending in .npz"],
-        "link.npz": ["link.npz is the input"],
+        "link.npz": ["link.npz: expected another file than the input, got the same"],
         "x" * 300 + ".npz": ["File name too long"],
     }.items():
         refused(rosafe("process", "in.wav", *SMALL, "--force", "-o", out, cwd=folder), *words)

@@ -299,7 +299,9 @@ def test_channels(tmp_path: Path) -> None:
         command("process", "mono.wav", "--channels", "1,2", cwd=tmp_path),
         "mono.wav: expected a file with channel 2, got 1 (the file is mono)",
     )
-    refused(command("process", "five.wav", cwd=tmp_path), "has 5 channels", "--channels 1,2 takes the first two")
+    refused(
+        command("process", "five.wav", cwd=tmp_path), "left and right ear, got 5", "--channels 1,2 takes the first two"
+    )
     refused(command("process", "mono.wav", cwd=tmp_path), "is mono)", "--channels 1,1 uses it for both")
 
 
@@ -349,4 +351,7 @@ def test_a_bag_with_several_streams(tmp_path: Path) -> None:
         "rosafe record OUT.wav",
     )
     (tmp_path / "cut.bag").write_bytes((tmp_path / "a.bag").read_bytes()[:3000])
-    refused(command("process", "cut.bag", *SMALL, cwd=tmp_path), "cut.bag was not closed by its recorder")
+    refused(
+        command("process", "cut.bag", *SMALL, cwd=tmp_path),
+        "cut.bag: expected a complete bag, got one that was not closed by its recorder",
+    )
