@@ -19,7 +19,7 @@ from rosafe.offline.process import ProcessCall, process
 from rosafe.offline.result import Result
 from rosafe.tree.workers import workers_to_use
 
-_TINY = np.finfo(np.float64).tiny
+_TINY = float(np.finfo(np.float64).tiny)
 
 
 def to_db(
@@ -61,10 +61,11 @@ def to_db(
     array = array if array.dtype.kind == "f" else array.astype(np.float64)
     if np.any(array < 0):
         raise ValueError(f"values: expected no negative numbers, got {np.nanmin(array):g}")
+    one = 0.0
     if isinstance(reference, str) and reference == "max":
         one = max(float(np.nanmax(array, initial=0.0)), _TINY)
-    else:
-        one = float(reference) if is_number(reference) else 0.0
+    elif is_number(reference):
+        one = float(reference)
     if not 0 < one < np.inf:
         raise ValueError(f'reference: expected a positive finite number or "max", got {short_repr(reference)}')
     if floor is not None and not is_number(floor):

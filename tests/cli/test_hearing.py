@@ -62,12 +62,14 @@ def test_mono_and_short_files(tmp_path: Path) -> None:
     assert command("process", "mono.wav", "--outputs", "ratemap", *SMALL, cwd=tmp_path).returncode == 0
     assert rosafe.load(tmp_path / "mono.npz")["ratemap"].shape == (1, 4, 99)
     done = command("process", "mono.wav", "--outputs", "ratemap,ild", "--force", *SMALL, cwd=tmp_path)
-    assert done.returncode == 1 and "expected two, left and right ear" in done.stderr
+    assert done.returncode == 1 and "expected two channels, left and right ear, got 1" in done.stderr
     done = command("process", "short.wav", "-q", *SMALL, cwd=tmp_path)
     assert done.returncode == 0 and "ild, ratemap, crossCorrelation: no frames" in done.stderr
     done = command("process", "short.wav", "-q", "--pad", "--force", *SMALL, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert rosafe.load(tmp_path / "short.npz")["ild"].shape == (4, 1)
+    done = command("plot", "short.wav", "--outputs", "ild", *SMALL, cwd=tmp_path)
+    assert done.returncode == 0 and done.stderr.endswith("windows that they need; see rosafe process --pad\n")
 
 
 SCRIPT = """
