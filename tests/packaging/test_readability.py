@@ -125,7 +125,7 @@ MAX_MARKED_PERCENT: dict[str, float] = {
     "rosafe/offline": 1.0,
     "rosafe/representations": 1.0,
     "rosafe/setups": 1.4,
-    "rosafe/sound": 2.4,
+    "rosafe/sound": 1.5,
     "rosafe/transport": 1.6,
     "rosafe/tree": 1.2,
     "rosafe/validation": 0.0,
