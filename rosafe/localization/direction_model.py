@@ -87,8 +87,8 @@ class DirectionModel:
         self.is_sphere = bool(description["is_sphere"])
         self.level_gain_db = float(description["level_gain_db"])
         # Half precision, as in files, so that a learned and a loaded model give the same numbers.
-        self.itd_table = np.asarray(itd_table, np.float16).astype(np.float32)
-        self.ild_table = np.asarray(ild_table, np.float16).astype(np.float32)
+        self.itd_table = np.asarray(itd_table, np.float16).astype(np.float32, order="C")
+        self.ild_table = np.asarray(ild_table, np.float16).astype(np.float32, order="C")
         self._tables = kernels.EvidenceTables(
             self.itd_table, self.ild_table, ITD_BINS, ILD_BINS, LEVEL_CLASSES, LEVEL_STEP
         )

@@ -14,6 +14,7 @@ import pytest
 import rosafe
 from rosafe.localization import model_cache, training
 from rosafe.localization.cues import KINDS
+from rosafe.localization.direction_model import DirectionModel
 from tests.localization.conftest import RATE, modulated
 
 
@@ -259,3 +260,13 @@ def test_damaged_models_are_one_line(tmp_path: Path, sphere_model: Path) -> None
     os.mkfifo(fifo)
     with pytest.raises(ValueError, match="got a FIFO"):
         rosafe.Localizer(RATE, fifo)
+
+
+def test_the_memory_order_of_the_tables_does_not_matter(sphere_model: Path) -> None:
+    """As numpy interpolates them for recordings: the kernel reads rows of contiguous memory."""
+    model = DirectionModel.load(sphere_model)
+    description = {**vars(model), "parameters": model.parameters}
+    other = DirectionModel(description, *(np.asfortranarray(table) for table in (model.itd_table, model.ild_table)))
+    assert other.itd_table.flags.c_contiguous and other.ild_table.flags.c_contiguous
+    sound = rosafe.Head.sphere().render(modulated(0.3, 2), RATE, 30)
+    _equal(rosafe.localize(sound, RATE, model), rosafe.localize(sound, RATE, other))  # type: ignore[arg-type]
