@@ -464,8 +464,8 @@ MUTATIONS = (
     _localization(
         "azimuth-difference-not-wrapped",
         "angles.py",
-        "return wrap(np.asarray(first, np.float64) - np.asarray(second, np.float64))",
-        "return np.asarray(first, np.float64) - np.asarray(second, np.float64)",
+        "return wrap(first - second)",
+        "return first - second",
         "tests/localization/test_tracker.py tests/localization/test_head.py",
     ),
     _localization(

@@ -15,6 +15,7 @@ import itertools
 import logging
 import re
 import resource
+import socket
 import termios
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -28,6 +29,7 @@ from rosafe.http_server.refusal import HttpRefusal
 
 BUFFER = 4 * 1024  # bytes of a request that are not counted; bytes read at a time
 HEADERS_SIZE = 64 * 1024  # bytes of all headers of a request
+SEND_BUFFER = 256 * 1024  # bytes of an answer in the kernel, by default up to 4 MB, which pause_writing does not report
 STALL_SECONDS = 60.0  # until a client that does not read its answer is disconnected
 YIELD_SECONDS = 5.0  # the same, if other clients need the memory
 LOG_SECONDS = 60.0  # between two log entries about the connection limit
@@ -276,6 +278,7 @@ class HttpConnection(web.RequestHandler):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._socket = cast(asyncio.Transport, transport)
+        transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self._socket.set_write_buffer_limits(high=0)  # so that pause_writing reports everything that is not read
         self._socket.max_size = BUFFER  # type: ignore[attr-defined]  # asyncio reads 256 KiB at a time
         account = self._connections.admit(self, _address(transport.get_extra_info("peername")))

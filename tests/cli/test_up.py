@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from rosafe.transport.master import MasterError, check_master
+from tests import models
 from tests.harness import ROOT, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
 from tests.terminal import Terminal
 
@@ -103,9 +104,10 @@ def test_the_localizer_of_a_setup(alone: Graph, tmp_path: Path) -> None:
         assert up.stop(signal.SIGINT) == 0, up
 
 
-def test_one_command_for_a_robot(alone: Graph) -> None:
+def test_one_command_for_a_robot(alone: Graph, tmp_path_factory: pytest.TempPathFactory) -> None:
+    models.learn(tmp_path_factory, 44100.0)
     command = ("rosafe", "up", "--device", "scene:?seconds=3", "--localize", "--port", str(free_port()))
-    with alone.start(*command) as up:
+    with alone.start(*command, XDG_CACHE_HOME=str(models.cache(tmp_path_factory))) as up:
         wait_until(up, "localizer +runs +head: sphere")
         wait_until(up, r"bass +runs +acquires from scene:\?seconds=3")
         wait_until(up, "rosAFE +runs +[1-9][0-9]* processors")  # those of the localizer

@@ -300,7 +300,7 @@ def test_wrong_command_lines(graph: Graph, tmp_path: Path, sphere_model: Path) -
         assert done.returncode != 0 and "Traceback" not in done.stderr
         return done.stderr
 
-    assert "expected a sound file with --yaw" in refused("--yaw", "x.csv")
+    assert "--yaw: expected a sound file" in refused("--yaw", "x.csv")
     assert "expected a learned model, got a missing file" in refused("--head", str(tmp_path / "none"))
     assert "x.sofa" in refused("--head", str(tmp_path / "x.sofa"))
     assert "world_frame: expected another frame than head_frame" in refused("--world-frame", "head")
