@@ -52,6 +52,7 @@ class Parameter:
     least: int = 0
     most: int = MAX_SEQUENCE
     longest: int = MAX_STRING
+    ascending: bool = False  # each number of a sequence is above the previous one
     zero_is_default: bool = True  # in ROS requests, which carry no defaults
     follows_rate: bool = False  # if no value is given, the default may be replaced by one that suits the sample rate
     checked_by_client: bool = False  # for a number in the component, whose error could not name the choices
@@ -107,6 +108,8 @@ class Parameter:
         if len(items) < self.least:
             values = "1 value" if self.least == 1 else f"{self.least} values"
             raise ValueError(f"{self.name}: expected at least {values}, got {len(items) or 'none'}")
+        if self.ascending and any(low >= high for low, high in itertools.pairwise(checked)):
+            raise self._error(checked, "ascending numbers")
         return checked
 
     def _items(self, of: str, value: Any) -> list[Any]:

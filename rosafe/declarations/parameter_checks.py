@@ -30,7 +30,7 @@ def _bad_spellings(value: Any) -> str:
 _FIELDS = {
     "name": bad_name,
     **dict.fromkeys(("doc", "fallback", "unit"), bad_optional_text),
-    **dict.fromkeys(("open_minimum", "zero_is_default", "follows_rate"), bad_flag),
+    **dict.fromkeys(("open_minimum", "zero_is_default", "follows_rate", "ascending"), bad_flag),
     **dict.fromkeys(("least", "most", "longest"), bad_count),
     "spellings": _bad_spellings,
 }

@@ -7,18 +7,27 @@ from typing import Any
 
 from rosafe.declarations.text import did_you_mean, short_repr
 from rosafe.interface import CORE_REPRESENTATIONS, KINDS, Parameter
+from rosafe.representations import STAGES
 
 _BY_NAME = {name: p for kind in KINDS.values() for p in kind.parameters for name in (p.name, *p.aliases)}
 _BY_FORMER_NAME = {name: p for kind in KINDS.values() for p in kind.parameters for name in p.former}
 
 
 def check_parameters(parameters: Any) -> dict[str, Any]:
-    """Return declared names and checked values of a dict of parameters (None: an empty one), or raise ValueError."""
+    """Return declared names and checked values of a dict of parameters (None: an empty one), or raise ValueError.
+
+    Combinations are checked too, except with the sample rate: fb_lowFreqHz is below fb_highFreqHz.
+    """
     if parameters is None:
         return {}
     if not isinstance(parameters, Mapping):
         raise ValueError(f"parameters: expected a dict of names and values, got {type(parameters).__name__}")
-    return dict(check_parameter(name, value) for name, value in parameters.items())
+    checked = dict(check_parameter(name, value) for name, value in parameters.items())
+    for kind, declared in KINDS.items():
+        defaults = {p.name: p.default for p in declared.parameters}
+        if not checked.keys().isdisjoint(defaults):
+            STAGES[kind].effective_values({name: checked.get(name, default) for name, default in defaults.items()})
+    return checked
 
 
 def check_parameter(name: Any, value: Any, text: bool = False) -> tuple[str, Any]:

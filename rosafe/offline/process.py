@@ -205,7 +205,7 @@ class ProcessCall:
         for block, name, value in changes:
             if block < count:
                 self.chain.schedule(block, name, value)
-                self.values[name] = value
+                self.values = check_parameters({**self.values, name: value})
                 size = max(size, self._size(pad, largest_block))
                 if pad:  # twice, as the frames before and after the change may be offset
                     self.padding = max(self.padding, 2 * self.chain.padding(frames))

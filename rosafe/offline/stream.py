@@ -250,6 +250,7 @@ class Stream:
         """
         try:
             name, value = check_change(name, value)
+            check_parameters({**self._values, name: value})
             changed = {kind: copy.copy(stage) for kind, stage in self._stages.items()}
             for kind, stage in changed.items():
                 stage.set_input_format(_input_format(kind, changed, self._sound))

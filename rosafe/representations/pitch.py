@@ -57,6 +57,7 @@ class Pitch(Stage):
                 aliases=("p_pitchRangeHz",),
                 least=2,
                 most=2,
+                ascending=True,
                 unit="Hz",
             ),
             Parameter(
@@ -154,8 +155,6 @@ class Pitch(Stage):
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         low, high = values["pi_rangeHz"]
-        if low >= high:
-            raise ValueError(f"pi_rangeHz: expected the lowest and the highest pitch, got {low:.12g}, {high:.12g} Hz")
         seconds = np.arange(self.input_format.lags + 1) / self.sample_rate
         within = np.flatnonzero((seconds >= 1 / high) & (seconds <= 1 / low))
         if len(within) < 3:

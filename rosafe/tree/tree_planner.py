@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from rosafe.declarations import plugins
 from rosafe.declarations.text import did_you_mean
 from rosafe.interface import KINDS, REQUEST, ROSAFE, ComponentError, Representation, format_value
-from rosafe.interface.arguments import check_parameter
+from rosafe.interface.arguments import check_parameters
 from rosafe.representations import PROBLEMS, STAGES
 
 INTERRUPTED = "::genom::interrupted"
@@ -149,7 +149,7 @@ def parse_request(kind: Representation, values: Mapping[str, Any]) -> TreeReques
             if name in values:
                 REQUEST.parameter(name).check(values[name])
         # Parameters of none of the processors have no effect, but they are checked too.
-        checked = dict(check_parameter(name, value) for name, value in values.items() if name not in OF_THE_INPUT)
+        checked = check_parameters({name: value for name, value in values.items() if name not in OF_THE_INPUT})
         specs = tuple(_spec(ancestor, checked) for ancestor in ancestor_kinds(kind))
     except ValueError as problem:
         raise ROSAFE.error("e_badNewValue", what=str(problem)) from None

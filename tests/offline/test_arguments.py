@@ -144,6 +144,27 @@ def test_parameters(parameters: Any, match: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("parameters", "match"),
+    [
+        ({"pi_rangeHz": [400, 80]}, r"pi_rangeHz: expected ascending numbers, got \[400.0, 80.0\]"),
+        ({"pi_rangeHz": [80, 80]}, r"pi_rangeHz: expected ascending numbers, got \[80.0, 80.0\]"),
+        ({"fb_lowFreqHz": 5000, "fb_highFreqHz": 100}, r"fb_lowFreqHz: expected less than fb_highFreqHz \(100 Hz\), "),
+        ({"ams_lowFreqHz": 500, "ams_highFreqHz": 5}, r"ams_highFreqHz: expected more than ams_lowFreqHz \(500 Hz\), "),
+    ],
+)
+def test_descending_ranges_of_processors_that_are_not_computed(parameters: dict[str, Any], match: str) -> None:
+    refused(match, GOOD, RATE, parameters=parameters, outputs="input")
+    with pytest.raises(ValueError, match=f"^{match}"):
+        rosafe.Stream(RATE, parameters, "input")
+    changes = [(0, name, value) for name, value in parameters.items()]
+    refused(match, GOOD, RATE, modifications=changes, outputs="input")
+    stream = rosafe.Stream(RATE, outputs="input")
+    with pytest.raises(ValueError, match=f"^{match}"):
+        for name, value in parameters.items():
+            stream.modify(name, value)
+
+
+@pytest.mark.parametrize(
     "block_frames",
     [
         *(0, -1, 1.5, 12000.0, np.nan, None, True, "100", b"100", [], (), [100, 0], [100, -1], [100, "1"], [[1, 2]]),

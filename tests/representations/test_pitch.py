@@ -127,7 +127,7 @@ def test_the_range(rate: float, limits: list[float]) -> None:
         with pytest.raises(ValueError, match=r"^pi_rangeHz: .* lags"):
             Pitch(format_, pi_rangeHz=limits)
         return
-    with pytest.raises(ValueError, match=r"^pi_rangeHz: expected the lowest and the highest pitch, got "):
+    with pytest.raises(ValueError, match=r"^pi_rangeHz: expected ascending numbers, got "):
         Pitch(format_, pi_rangeHz=limits[::-1])
     for given_limits in (limits,):
         stage = Pitch(format_, pi_rangeHz=given_limits, pi_medianOrder=1)

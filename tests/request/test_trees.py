@@ -327,13 +327,15 @@ def test_the_sound() -> None:
         ({"ild_wSizeSec": 61.0}, "ild_wSizeSec: expected a number above 0, at most 60, got 61"),
         ({"fb_lowFreqHz": 600.0, "fb_highFreqHz": 500.0}, "fb_lowFreqHz: expected less than fb_highFreqHz"),
         ({"rm_decaySec": -1.0}, "rm_decaySec: expected a number above 0, at most 3600, got -1"),
+        ({"pi_rangeHz": [400.0, 80.0]}, "pi_rangeHz: expected ascending numbers, got [400.0, 80.0]"),
+        ({"ams_lowFreqHz": 500.0, "ams_highFreqHz": 5.0}, "ams_highFreqHz: expected more than ams_lowFreqHz (500 Hz)"),
         ({"nFramesPerBlock": 0}, "nFramesPerBlock: expected a number from 1 to 10000000, got 0"),
         ({"bufferSize_s_port": 1e9}, "bufferSize_s_port"),
     ],
 )
 def test_values_impossible_at_any_sample_rate_are_rejected_without_a_call(values: dict[str, Any], what: str) -> None:
     model = Model()
-    with pytest.raises(ComponentError, match=what) as refused:
+    with pytest.raises(ComponentError) as refused:
         build(model, "ild", **values)
     assert refused.value.ex == "::rosAFE::e_badNewValue"
     assert what in refused.value.detail["what"]
