@@ -56,6 +56,8 @@ def _as_array(signal: Any) -> np.ndarray:
 
 def as_samples(ears: np.ndarray) -> np.ndarray:
     """Return the samples of `ears_view` as float64, or as int32 with full scale at 2**31."""
+    if ears.dtype == np.float64:
+        return ears
     if ears.dtype.kind == "f":
         with np.errstate(over="ignore"):  # a long double beyond the range of double becomes infinite
             return np.asarray(ears, np.float64)

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from rosafe.declarations.literature import MEDDIS_1997, SLANEY_1990
@@ -111,11 +110,13 @@ class Pitch(Stage):
         if channels != self._channels:
             self._begin(len(correlations), channels)
         summary = correlations[:, :, self._range].sum(axis=1) / channels
-        lag, confidence = highest_peak(np.ascontiguousarray(summary.swapaxes(1, 2)))
-        raw = np.divide(self.sample_rate, lag + self._range.start, out=np.zeros(lag.shape), where=confidence > 0)
+        arriving = np.zeros((len(summary), 3, summary.shape[-1]))
+        chosen, raw, confidence = arriving[:, 0], arriving[:, 1], arriving[:, 2]
+        lag, confidence[:] = highest_peak(np.ascontiguousarray(summary.swapaxes(1, 2)))
+        np.divide(self.sample_rate, lag + self._range.start, out=raw, where=confidence > 0)
         self._confidences, greatest = running_maximum(self._confidences, confidence, self._reach)
-        chosen = np.where(confidence < self.values["pi_confThres"] * greatest, 0.0, raw)
-        return self._emit(np.stack((chosen, raw, confidence), axis=1))
+        np.copyto(chosen, raw, where=confidence >= self.values["pi_confThres"] * greatest)
+        return self._emit(arriving)
 
     def _emit(self, arriving: FloatArray) -> FloatArray:
         """Return the frames to output after new frames (2, 3, F) of q, rawPitch and confidence."""
@@ -126,7 +127,8 @@ class Pitch(Stage):
         output = frames[..., first : first + count].copy()
         if count:
             begin = first - order // 2
-            windows = np.sort(sliding_window_view(frames[:, 0, begin : begin + count + order - 1], order, axis=-1))
+            windows = frames[:, 0, begin + np.arange(count)[:, np.newaxis] + np.arange(order)]
+            windows.sort()
             median = (windows[..., (order - 1) // 2] + windows[..., order // 2]) / 2
             output[:, 0] = np.where(median > 0, median, np.nan)
         self._pending_frames = held - count
@@ -175,10 +177,11 @@ def highest_peak(curves: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
     inner = curves[..., 1:-1]
     tops = (inner > curves[..., :-2]) & (inner >= curves[..., 2:])
     heights = np.where(tops, inner, -np.inf)
-    place = heights.argmax(axis=-1)[..., np.newaxis]
-    height = np.take_along_axis(heights, place, axis=-1)
-    if (height > np.take_along_axis(curves, place + 2, axis=-1)).all():  # no plateaus: the usual case
-        return place[..., 0] + 1, np.maximum(height[..., 0], 0.0)
+    peak = heights.argmax(axis=-1) + 1
+    height = heights.max(axis=-1)
+    after = peak + 1 + curves.shape[-1] * np.arange(peak.size).reshape(peak.shape)
+    if (height > curves.take(after)).all():  # no plateaus: the usual case
+        return peak, np.maximum(height, 0.0)
     return _highest_of_plateaus(curves)
 
 
