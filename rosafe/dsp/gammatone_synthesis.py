@@ -26,6 +26,10 @@ _BAND = (
 )  # relative to the lowest and highest centre frequency: the range in which causal synthesis is optimized
 _PAST_SECONDS = 0.004  # of a causal filter beyond its delay
 _ITERATIONS = 30
+_END_SECONDS = 0.03  # before an abrupt end: the sound that is estimated together with the outputs after it
+_MAX_END = 2048  # the same in samples
+_END_ROUNDS = 2
+_END_LOADING = 1e-10  # relative to the power response: the least noise that is assumed
 _LOADING = 1e-4  # relative to the power response: keeps the filters near those that have only been cut
 _OUTSIDE = 1e-3  # weight of frequencies outside the range
 
@@ -71,6 +75,75 @@ def _level(power: FloatArray, frequencies: FloatArray, sample_rate: float) -> fl
     """Return the typical power response at the centre frequencies (Hz), at least 1, as of one channel."""
     bins = np.rint(frequencies * (2 * (len(power) - 1) / sample_rate)).astype(int)
     return max(1.0, float(np.median(power[bins])))
+
+
+def end_samples(sample_rate: float) -> int:
+    """Return how many samples before an abrupt end `outputs_after_end` estimates."""
+    return min(_MAX_END, round(_END_SECONDS * sample_rate))
+
+
+def outputs_after_end(
+    channels: FloatArray, analysis: ComplexArray, synthesis: ComplexArray, size: int, length: int, unknown: int
+) -> FloatArray:
+    """Estimate the outputs of causal filters after the end of a sound from those before it.
+
+    The last samples of the sound are the least-squares solution, given the outputs until the end; the filters then give
+    the outputs after it. The sound before these samples is synthesized, in the second round with the outputs of the
+    first one. The solution assumes noise with the power of its own residual, so that outputs that belong to no
+    sound are not amplified.
+
+    Parameters
+    ----------
+    channels : ndarray, (ears, C, W)
+        The last outputs.
+    analysis, synthesis : ndarray, (C, size // 2 + 1)
+        Frequency responses; see `synthesis_responses`.
+    size : int
+        Samples of a Fourier transform: the outputs, with zeros before and after them.
+    length, unknown : int
+        Samples of the outputs after the end, and of the sound before it that is estimated.
+
+    Returns
+    -------
+    ndarray, (ears, C, length)
+    """
+    ears, count, width = channels.shape
+    end = (size + width) // 2
+    solved, after = slice(end - unknown, end), slice(end, end + length)
+    impulses = np.stack([scipy.fft.irfft(row, size)[:unknown] for row in analysis])
+    gram = impulses.T @ impulses  # between impulses at two distances from the end
+    for row in range(1, unknown):
+        gram[row, 1:] += gram[row - 1, :-1]
+    level = np.trace(gram) / unknown
+    transforms = scipy.fft.rfft(impulses, 2 * unknown).conj()
+    tail = np.zeros((ears, count, length))
+    padded = np.zeros((ears, size))
+    for _ in range(_END_ROUNDS):
+        total = np.zeros((ears, size // 2 + 1), np.complex128)
+        for channel, response in enumerate(synthesis):
+            padded[:, end - width : end], padded[:, after] = channels[:, channel], tail[:, channel]
+            total += response * scipy.fft.rfft(padded)
+        sound = scipy.fft.irfft(total, size)
+        sound[:, end - unknown :] = 0
+        spectrum = scipy.fft.rfft(sound)
+        products, power = np.zeros((ears, unknown)), 0.0
+        for channel, response in enumerate(analysis):
+            rest = channels[:, channel, width - unknown :] - scipy.fft.irfft(response * spectrum, size)[:, solved]
+            products += scipy.fft.irfft(transforms[channel] * scipy.fft.rfft(rest, 2 * unknown))[:, :unknown]
+            power += float(np.sum(rest**2))
+        if not power:
+            break
+        products = products[:, ::-1].T  # by the distance from the end
+        loading = _END_LOADING
+        for _ in range(2):  # the second time with the noise that the first solution leaves
+            factors = scipy.linalg.cho_factor(gram + loading * level * np.eye(unknown))
+            solution = scipy.linalg.cho_solve(factors, products)
+            loading = max(loading, (1 - float(np.sum(solution * products)) / power) / count)
+        sound[:, solved] = solution[::-1].T
+        spectrum = scipy.fft.rfft(sound)
+        for channel, response in enumerate(analysis):
+            tail[:, channel] = scipy.fft.irfft(response * spectrum, size)[:, after]
+    return tail
 
 
 def causal_synthesis(

@@ -181,11 +181,9 @@ class _Enhancer:
         output = np.empty((2, samples))
         for first in range(0, mask.shape[1], step):
             begin, end = max(0, first - context), min(first + step, mask.shape[1]) + context
-            # silence behind the end: the response of the filters to the last samples would be missing otherwise
-            block = np.zeros((2, (end - begin) * hop), self._view.dtype)
-            block[:, : samples - begin * hop] = self._view[:, begin * hop : end * hop]
+            block = self._view[:, begin * hop : end * hop]
             result = process(block, self._rate, parameters=values, outputs=["gammatone"])
-            enhanced = resynthesize(result, mask[:, np.minimum(np.arange(begin, end), mask.shape[1] - 1)])
+            enhanced = resynthesize(result, mask[:, begin:end])
             part = output[:, first * hop : (first + step) * hop]
             part[:] = enhanced[:, (first - begin) * hop :][:, : part.shape[1]]
         return output

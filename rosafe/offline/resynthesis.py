@@ -15,6 +15,8 @@ from rosafe.dsp.framing import FrameGrid
 from rosafe.dsp.gammatone_synthesis import (
     ComplexArray,
     causal_synthesis,
+    end_samples,
+    outputs_after_end,
     response_length,
     responses,
     synthesis_responses,
@@ -65,9 +67,8 @@ def resynthesize(result: Result, mask: Any = None) -> FloatArray:
     -----
     The channels pass the time-reversed filters, and their sum is equalized: the least-squares solution, without delay.
     Frequencies from about half of the lowest centre frequency on are restored, up to a little above the highest one.
-    The last 20 ms are incomplete (error -11 dB), as the response of the filters to them is not in the result. Append
-    0.1 s of silence to the sound if they matter (-50 dB). Level scaling, pre-emphasis and the middle ear are
-    compensated; DC removal and gain control are not.
+    The response of the filters to the end of the sound, which is not in the result, is estimated from the channels.
+    Level scaling, pre-emphasis and the middle ear are compensated; DC removal and gain control are not.
 
     Examples
     --------
@@ -155,10 +156,10 @@ class _Mask:
             self._middles = np.arange(weights.shape[2]) * grid.hop + len(grid.window) / 2
 
     def of(self, channel: int, first: int, end: int) -> FloatArray:
-        """Return the weights (ears or 1, n) of a channel for the samples from `first` to `end`."""
+        """Return the weights (ears or 1, n) of a channel for the samples from `first` to `end`, after its end the last ones."""
         rows = self.weights[:, channel]
         if self._middles is None:
-            return rows[:, first:end]
+            return rows[:, np.minimum(np.arange(first, end), rows.shape[1] - 1)]
         if not len(self._middles):
             return np.ones((1, end - first))
         return np.stack([np.interp(np.arange(first, end), self._middles, row) for row in rows])
@@ -220,8 +221,15 @@ class _Synthesis:
         longest = max(min(_CHUNK, _RESPONSES // len(frequencies)), 4 * self._overlap)
         self._size = scipy.fft.next_fast_len(min(longest, samples + 2 * self._overlap), real=True)
         self._step = self._size - 2 * self._overlap
-        filters = synthesis_responses(responses(self._size, *bank), frequencies, sample_rate)
-        self._filters = filters * _compensation(values, sample_rate, self._size)
+        self._filters = _filters(values, self._size, *bank)[1]
+        length = response_length(*bank)
+        unknown = min(samples, end_samples(sample_rate))
+        width = min(samples, unknown + 2 * length)
+        size = scipy.fft.next_fast_len(width + 2 * length, real=True)
+        self._after = np.zeros((*channels.shape[:2], 0))  # outputs after the end, (ears, C, length)
+        if samples:
+            last = channels[..., samples - width :]
+            self._after = outputs_after_end(last, *_filters(values, size, *bank), size, length, unknown)
 
     def run(self) -> FloatArray:
         """Return the sound, (ears, N)."""
@@ -240,13 +248,15 @@ class _Synthesis:
     def _chunk(self, sound: FloatArray, first: int) -> None:
         """Compute the samples of `sound` from `first` on, as many as a chunk has."""
         samples = sound.shape[1]
-        begin, end = max(0, first - self._overlap), min(samples, first + self._step + self._overlap)
-        lead = begin - (first - self._overlap)
+        begin = max(0, first - self._overlap)
+        end = min(samples + self._after.shape[2], first + self._step + self._overlap)
+        lead, known = begin - (first - self._overlap), min(samples, end) - begin
         padded = np.zeros((len(sound), self._size))
         total = np.zeros((len(sound), self._size // 2 + 1), np.complex128)
         for channel, response in enumerate(self._filters):
             block = padded[:, lead : lead + end - begin]
-            block[:] = self._channels[:, channel, begin:end]
+            block[:, :known] = self._channels[:, channel, begin : begin + known]
+            block[:, known:] = self._after[:, channel, : end - begin - known]
             if self._mask is not None:
                 block *= self._mask.of(channel, begin, end)
             total += response * scipy.fft.rfft(padded)
@@ -254,21 +264,27 @@ class _Synthesis:
         sound[:, first : first + count] = scipy.fft.irfft(total, self._size)[:, self._overlap : self._overlap + count]
 
 
-def _compensation(values: Mapping[str, Any], sample_rate: float, size: int) -> ComplexArray | float:
-    """Return the inverse of the response of level scaling, pre-emphasis and middle ear at the frequencies of an FFT."""
-    gain = 10 ** ((values["pp_refSPLdB"] - LEVEL_OF_RMS_1) / 20) if values["pp_bLevelScaling"] else 1.0
-    if not (values["pp_bPreEmphasis"] or values["pp_bMiddleEarFiltering"]):
-        return float(gain)
+def _filters(
+    values: Mapping[str, Any], size: int, sample_rate: float, frequencies: FloatArray, order: int, width: float
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return the frequency responses (C, size // 2 + 1) from the sound to the channels, and those of the synthesis."""
+    analysis = responses(size, sample_rate, frequencies, order, width)
+    synthesis = synthesis_responses(analysis, frequencies, sample_rate)
+    preprocessing = _preprocessing(values, sample_rate, size)
+    power = np.abs(preprocessing) ** 2
+    synthesis *= preprocessing.conj() / np.maximum(power, _MAX_COMPENSATION * power.max())
+    analysis *= preprocessing
+    return analysis, synthesis
+
+
+def _preprocessing(values: Mapping[str, Any], sample_rate: float, size: int) -> ComplexArray:
+    """Return the response of level scaling, pre-emphasis and middle ear at the frequencies of an FFT."""
     own = {parameter.name for parameter in KINDS["preProc"].parameters}
     chosen = {name: value for name, value in values.items() if name in own}
-    stage = PreProc(
-        sample_rate, **{**chosen, "pp_bRemoveDC": False, "pp_bNormalizeRMS": False, "pp_bLevelScaling": False}
-    )
     impulse = np.zeros((2, size))
     impulse[:, 0] = 1.0
-    response = scipy.fft.rfft(stage.process(impulse)[0])
-    power = np.abs(response) ** 2
-    return np.asarray(gain * response.conj() / np.maximum(power, _MAX_COMPENSATION * power.max()))
+    stage = PreProc(sample_rate, **{**chosen, "pp_bRemoveDC": False, "pp_bNormalizeRMS": False})
+    return np.asarray(scipy.fft.rfft(stage.process(impulse)[0]))
 
 
 class Resynthesizer:
@@ -329,7 +345,8 @@ class Resynthesizer:
         filters, self.error_db = causal_synthesis(
             sample_rate, described["fb_cfHz"], values["fb_nGamma"], values["fb_bwERBs"], self.delay_samples
         )
-        self._filters = filters * _compensation({**values, "pp_bPreEmphasis": 0, "pp_bMiddleEarFiltering": 0}, 0, 0)
+        scaling = (values["pp_refSPLdB"] - LEVEL_OF_RMS_1) / 20 if values["pp_bLevelScaling"] else 0.0
+        self._filters = filters * 10**scaling
         self._spectra: tuple[int, ComplexArray | None] = (0, None)  # size and transform of the filters
         self.reset()
 

@@ -124,6 +124,46 @@ def test_masks_scale_and_select() -> None:
     assert np.median(spectrum[:, (bins > 1500) & (bins < 4000)]) < 0.01
 
 
+@pytest.mark.parametrize("rate", [8000, 16000, 44100, 96000])
+@pytest.mark.parametrize("options", [{}, {"pad": True}, {"dtype": "float32"}])
+def test_abrupt_ends(rate: int, options: dict[str, Any]) -> None:
+    """The last 20 ms, which the response of the filters follows, are as those of a sound that silence follows."""
+    count = round(0.3 * rate)
+    noise = sound(rate, 150.0, 3000.0)[:, rate // 5 : rate // 5 + count]
+    last = slice(count - round(0.02 * rate), None)
+    followed = rosafe.process(np.pad(noise, ((0, 0), (0, rate // 5))), rate, outputs=["gammatone"])
+    best = error_db(rosafe.resynthesize(followed)[:, :count][:, last], noise[:, last])
+    found = rosafe.resynthesize(rosafe.process(noise, rate, outputs=["gammatone"], **options))
+    assert error_db(found[:, last], noise[:, last]) < max(best, -50.0) + 6.0
+    assert best < -30
+
+
+@pytest.mark.parametrize(
+    "parameters", [{"pp_bMiddleEarFiltering": True, "pp_middleEarModel": "lopezpoveda"}, {"pp_bPreEmphasis": True}]
+)
+def test_abrupt_ends_of_preprocessed_sound_and_with_masks(parameters: dict[str, Any]) -> None:
+    rate, count = 16000, 4000
+    noise = sound(rate, 300.0, 3000.0)[:, rate // 5 : rate // 5 + count]
+    followed = np.pad(noise, ((0, 0), (0, count)))
+    short, long = (
+        rosafe.process(ears, rate, parameters=parameters, outputs=["gammatone", "ild"]) for ears in (noise, followed)
+    )
+    high = (short["fb_cfHz"] > 1000)[:, np.newaxis]
+    for of_short, of_long in ((short["ild"].shape[1], long["ild"].shape[1]), (count, 2 * count)):
+        found = rosafe.resynthesize(short, high * np.ones(of_short))
+        kept = rosafe.resynthesize(long, high * np.ones(of_long))[:, :count]
+        assert error_db(found[:, -320:], kept[:, -320:]) < -30
+
+
+def test_ends_of_channels_that_belong_to_no_sound_are_not_amplified() -> None:
+    rate = 16000
+    random = np.random.default_rng(6)
+    for change in (random.random((31, 1)), random.random((2, 31, 4000)) > 0.5):
+        result = rosafe.process(sound(rate)[:, 3200:7200], rate, outputs=["gammatone"])
+        result["gammatone"] *= change
+        assert np.abs(rosafe.resynthesize(result)[:, -320:]).max() < np.abs(sound(rate)).max()
+
+
 def test_frames_of_a_mask_are_those_of_ild() -> None:
     """A mask that opens at a frame opens the sound at the middle of this frame."""
     rate = 16000
