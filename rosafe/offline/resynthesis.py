@@ -156,7 +156,7 @@ class _Mask:
             self._middles = np.arange(weights.shape[2]) * grid.hop + len(grid.window) / 2
 
     def of(self, channel: int, first: int, end: int) -> FloatArray:
-        """Return the weights (ears or 1, n) of a channel for the samples from `first` to `end`, after its end the last ones."""
+        """Return the weights (ears or 1, n) of a channel from sample `first` to `end`; the last one remains."""
         rows = self.weights[:, channel]
         if self._middles is None:
             return rows[:, np.minimum(np.arange(first, end), rows.shape[1] - 1)]
