@@ -171,17 +171,6 @@ GOODE_1994 = Reference(
     "15",
     "145-154",
 )
-HARRIS_1978 = Reference(
-    "harris1978",
-    "article",
-    "Harris, F. J.",
-    1978,
-    "On the use of windows for harmonic analysis with the discrete Fourier transform",
-    "Proc. IEEE",
-    "66",
-    "51-83",
-    doi="10.1109/PROC.1978.10837",
-)
 HOHMANN_2002 = Reference(
     "hohmann2002",
     "article",
@@ -288,7 +277,6 @@ LIBERMAN_1988 = Reference(
     "J. Neurophysiol.",
     "60",
     "1779-1798",
-    doi="10.1152/jn.1988.60.5.1779",
 )
 LICKLIDER_1951 = Reference(
     "licklider1951",
