@@ -14,6 +14,7 @@ import contextlib
 import ctypes
 import functools
 import importlib
+import io
 import json
 import os
 import runpy
@@ -268,8 +269,9 @@ def _become(request: Mapping[str, Any], streams: Sequence[int], base_path: Seque
     sys.path[:] = [str(script.parent), *messages, *base_path]
     sys.argv[:] = request["argv"]
     sys.stdin = open(0, errors=sys.stdin.errors, closefd=False)  # noqa: SIM115  # as long as the process
-    sys.stdout = open(1, "w", errors=sys.stdout.errors, closefd=False)  # noqa: SIM115
-    sys.stdout.reconfigure(write_through=bool(os.environ.get("PYTHONUNBUFFERED")))
+    unbuffered = bool(os.environ.get("PYTHONUNBUFFERED"))
+    binary = open(1, "wb", buffering=0 if unbuffered else -1, closefd=False)  # noqa: SIM115
+    sys.stdout = io.TextIOWrapper(binary, errors=sys.stdout.errors, write_through=unbuffered)
     sys.stderr = open(2, "w", buffering=1, errors="backslashreplace", closefd=False)  # noqa: SIM115
 
 

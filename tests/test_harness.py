@@ -9,6 +9,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
+import rospy
+from std_msgs.msg import Empty
 
 from tests import fork_server, harness
 from tests.harness import PYTHON, ROOT, Graph, Process, proc
@@ -86,6 +88,16 @@ def test_signals_reach_a_fork(tmp_path: Path) -> None:
             harness.wait_for(lambda: "waiting for a ROS master" in process.err, what=lambda: str(process))
             assert os.getsid(process.pid) == process.pid
             assert process.stop(number) == code, process
+
+
+def test_output_of_an_unbuffered_fork_is_visible_at_once(graph: Graph) -> None:
+    """`rostopic hz` never flushes its output."""
+    graph.client()
+    publisher = rospy.Publisher("/of_the_test/unbuffered", Empty, queue_size=1)
+    with graph.start("rostopic", "hz", publisher.resolved_name, PYTHONUNBUFFERED="1") as process:
+        assert isinstance(process._popen, fork_server.ForkedProcess)
+        harness.wait_for(lambda: "subscribed to" in process.out, what=lambda: str(process))
+    publisher.unregister()
 
 
 def test_programs_whose_imports_may_differ_are_not_forked(tmp_path: Path) -> None:
