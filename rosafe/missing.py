@@ -40,11 +40,14 @@ def install(module: str) -> str:
     """Return how to install a module."""
     top = module.partition(".")[0]
     extra, debian = _PACKAGES.get(top, ("", ""))
+    of_nodes = top.startswith(_ROS) or top in _WITH_ROS
     if not by_pip():
         if debian:
             return f"apt install {debian}, or pip install {top}"
-        return "apt install rosafe" if _DEBIAN_DIR in Path(__file__).parents else "run scripts/install"
-    if top.startswith(_ROS) or top in _WITH_ROS:
+        if _DEBIAN_DIR not in Path(__file__).parents:
+            return "run scripts/install"
+        return "install the Debian package rosafe" if of_nodes else f"apt install python3-{top}"
+    if of_nodes:
         return "pip does not install it: run scripts/install of a checkout, on Debian 12 or 13"
     # Not `rosafe[...]`: on PyPI, which does not have this project, the name could belong to others.
     return f"pip install '.[{extra}]' in a checkout" if extra else f"pip install {_OTHER_NAMES.get(top, top)}"

@@ -108,7 +108,9 @@ def _install_command() -> str:
     if root is not None:
         return f"run {root}/scripts/install"
     return (
-        "apt install rosafe" if paths.install_prefix() == paths.SYSTEM_PREFIX else "run scripts/install of a checkout"
+        "install the Debian package rosafe"
+        if paths.install_prefix() == paths.SYSTEM_PREFIX
+        else "run scripts/install of a checkout"
     )
 
 

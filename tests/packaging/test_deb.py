@@ -6,6 +6,7 @@ tests/packaging/fresh_packages installs, upgrades and purges them on minimal mac
 from __future__ import annotations
 
 import filecmp
+import gzip
 import os
 import re
 import shutil
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from rosafe import missing
 from rosafe.component import generate
 from rosafe.version import VERSION
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, wait_for
@@ -97,10 +99,10 @@ def test_maintainer_scripts_remove_what_programs_create(packages: dict[str, Path
     assert "/var/lib/private/rosafe" in (tmp_path / "rosafe" / "postrm").read_text("utf-8")
 
 
-def test_lintian_finds_no_error(packages: dict[str, Path]) -> None:
+def test_lintian_finds_nothing(packages: dict[str, Path]) -> None:
     if shutil.which("lintian") is None:
         pytest.skip("lintian is not installed; run scripts/install --tests")
-    done = run("lintian", "--fail-on", "error", *packages.values(), env=environment(LC_ALL="C.UTF-8"))
+    done = run("lintian", "--fail-on", "error,warning", *packages.values(), env=environment(LC_ALL="C.UTF-8"))
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -124,6 +126,19 @@ def test_files(root: Path) -> None:
             assert (root / program).exists() or program == "usr/bin/roscore"
         for document in re.findall(r"^Documentation=file:/(\S+)", text, re.MULTILINE):
             assert (root / document).is_file()
+
+
+def test_each_command_has_a_manual_page(root: Path) -> None:
+    """A page contains the whole help of its command, and that of each subcommand of rosafe."""
+    folder = root / "usr" / "share" / "man" / "man1"
+    for program in (root / "usr" / "bin").iterdir():
+        page = gzip.decompress((folder / f"{program.name}.1.gz").read_bytes()).decode().replace("\\", "")
+        assert page.splitlines()[0].startswith(f".TH {program.name} 1 2023-11-14 ")
+        assert f"usage: {program.name} [" in page
+    subcommands = re.findall(
+        r"^\.SS rosafe (\w+)$", gzip.decompress((folder / "rosafe.1.gz").read_bytes()).decode(), re.MULTILINE
+    )
+    assert subcommands == sorted(path.stem for path in (ROOT / "rosafe" / "commands").glob("[!_]*.py"))
 
 
 @pytest.mark.parametrize("package", ["rosAFE", "bass"])
@@ -191,3 +206,13 @@ def test_wrong_arguments(arguments: list[str]) -> None:
     done = run(ROOT / "scripts" / "make-deb", *arguments, env=environment())
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("usage: scripts/make-deb [FOLDER]")
+
+
+def test_advice_about_missing_packages_names_those_of_debian(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`apt install rosafe` would fail: Debian does not have that package."""
+    assert missing.install("matplotlib") == missing.install("rospy") == "run scripts/install"
+    monkeypatch.setattr(missing, "_DEBIAN_DIR", ROOT)
+    assert missing.install("matplotlib.pyplot") == "apt install python3-matplotlib"
+    assert {missing.install(name) for name in ("rospy", "aiohttp", "tkinter", "bass.msg")} == {
+        "install the Debian package rosafe"
+    }
