@@ -13,6 +13,7 @@ import atexit
 import contextlib
 import ctypes
 import functools
+import gc
 import importlib
 import io
 import json
@@ -38,9 +39,11 @@ MODULES: Mapping[str, Sequence[str]] = {
     "bass-ros": ("rosafe.bass.node", "rosafe.bass.sources.scene", *NODES),
     "genomixd": ("rosafe.genomix.daemon", *NODES),
     "rosafe": ("rosafe.commands.__main__",),
+    "rosmsg": ("rosmsg", "rospy"),
     "rosnode": ("rosnode", "rospy"),
     "rosparam": ("rosparam",),
     "rosservice": ("rosservice", "rospy"),
+    "rossrv": ("rosmsg", "rospy"),
     "rostopic": ("rostopic", "rospy"),
     "rosmaster": ("rosmaster", "rosmaster.main"),
 }
@@ -225,6 +228,7 @@ def _serve(requests: socket.socket) -> dict[str, Any]:
             request = json.loads(data)
             received = array.array("i", ancillary[0][2])
             _import(request["argv"])
+            gc.freeze()  # a collection in a child would write to, and therefore copy, the memory of all modules
             pid = os.fork()
             if pid == 0:
                 requests.close()
@@ -275,6 +279,25 @@ def _become(request: Mapping[str, Any], streams: Sequence[int], base_path: Seque
     sys.stderr = open(2, "w", buffering=1, errors="backslashreplace", closefd=False)  # noqa: SIM115
 
 
+def _run(script: str) -> None:
+    """Run a script and end the process without deleting the imported modules, which takes longer than most programs."""
+    status = None
+    try:
+        runpy.run_path(script, run_name="__main__")
+    except SystemExit as end:
+        status = end.code
+        if not (status is None or isinstance(status, int)):
+            raise
+    threading._shutdown()  # type: ignore[attr-defined]  # what Python does at the end, too: wait for threads, ...
+    atexit._run_exitfuncs()  # ... call the registered functions, ...
+    try:
+        sys.stdout.flush()  # ... and write the rest of the output
+        sys.stderr.flush()
+    except OSError:
+        sys.exit(status)  # Python reports it
+    os._exit((status or 0) & 0xFF)
+
+
 if __name__ == "__main__":
     program = _serve(socket.socket(fileno=int(sys.argv[1])))
-    runpy.run_path(program["argv"][0], run_name="__main__")
+    _run(program["argv"][0])
