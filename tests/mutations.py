@@ -759,6 +759,42 @@ MUTATIONS = (
         "",
         "tests/genomix/test_tcl.py",
     ),
+    # --- packages
+    Mutation(
+        "catkin-tcl-not-installed",
+        "CMakeLists.txt",
+        "install(DIRECTORY tcl/ DESTINATION ${CATKIN_GLOBAL_LIB_DESTINATION}/tcltk)\n",
+        "",
+        "tests/packaging/test_catkin.py -m 'not exploration'",
+    ),
+    Mutation(
+        "debian-dependency-missing",
+        "debian/control",
+        " python3-rosbag,\n",
+        "",
+        "tests/packaging/test_debian_folder.py",
+    ),
+    Mutation(
+        "debian-messages-link-into-the-checkout",
+        "debian/messages.py",
+        "            link.unlink()\n",
+        "            pass\n",
+        "tests/packaging/test_debian_folder.py",
+    ),
+    _dsp(
+        "kernels-truncated-library-loaded",
+        "kernels/build.py",
+        " or sums.get(p.name) != _sum(p)]",
+        "]",
+        "tests/packaging/test_kernels.py",
+    ),
+    _dsp(
+        "kernels-writable-by-others",
+        "kernels/build.py",
+        "found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX",
+        "False",
+        "tests/packaging/test_kernels.py",
+    ),
 )
 
 

@@ -25,13 +25,20 @@ CLANG = "clang"  # its kernels for the highest level of this processor
 Choice = int | str  # a level, CLANG, or one of `foreign.MACHINES`
 
 
-def levels() -> list[int]:
-    """Return the levels of kernels for this processor, ascending; none if they cannot be built."""
+@functools.cache
+def _libraries() -> dict[int, Path]:
+    """Return the kernels for this processor by level, ascending; none if they cannot be built."""
     try:
         paths = build.libraries()
     except build.BuildError:
-        return []
-    return [level for level in paths if level <= loader.load(paths[min(paths)]).rosafe_processor_level()]
+        return {}
+    highest = loader.load(paths[min(paths)]).rosafe_processor_level()
+    return {level: path for level, path in paths.items() if level <= highest}
+
+
+def levels() -> list[int]:
+    """Return the levels of kernels for this processor, ascending; none if they cannot be built."""
+    return list(_libraries())
 
 
 @functools.cache
@@ -60,6 +67,6 @@ def using(choice: Choice) -> Iterator[None]:
         elif isinstance(choice, int) and choice != NUMPY:
             if choice not in levels():
                 pytest.skip(f"no kernels of level {choice} here")
-            loaded = (loader.load(build.libraries()[choice]), loader.Status(True, f"level {choice}, for a test"))
+            loaded = (loader.load(_libraries()[choice]), loader.Status(True, f"level {choice}, for a test"))
         patch.setattr(kernels, "loaded", lambda: loaded)
         yield

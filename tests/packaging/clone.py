@@ -19,6 +19,9 @@ EXCLUDED = shutil.ignore_patterns(
 )
 
 
+REQUESTS = ("InputProc", "IhcProc", "Stop")  # a service, and actions with and without a parent
+
+
 @contextmanager
 def fresh_copy() -> Iterator[Path]:
     """Yield a copy of the checkout, like a new clone, in a folder that every user can read."""
@@ -27,6 +30,14 @@ def fresh_copy() -> Iterator[Path]:
         copy = Path(folder, "a checkout")  # the name contains a blank
         shutil.copytree(ROOT, copy, ignore=EXCLUDED, symlinks=True)
         yield copy
+
+
+def keep_few_requests(copy: Path) -> set[str]:
+    """Delete most requests of rosAFE, so that generators are quick; return the names of the deleted files."""
+    removed = {path for kind in ("action", "srv") for path in (copy / kind).iterdir() if path.stem not in REQUESTS}
+    for path in removed:
+        path.unlink()
+    return {path.name for path in removed}
 
 
 def environment(**more: str) -> dict[str, str]:

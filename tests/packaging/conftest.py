@@ -10,13 +10,15 @@ import pytest
 from tests.harness import folder_of_run
 from tests.packaging.clone import ENVIRONMENT
 
-# Runs gcc, and caches the result for each set of options and preprocessed sources, which contain no comments.
-GCC = """#!/usr/bin/python3
-import hashlib, os, pathlib, shutil, subprocess, sys
+# Runs gcc, and caches the result for each set of options, sources and headers, without their comments.
+GCC = r"""#!/usr/bin/python3 -IS
+import hashlib, os, pathlib, re, shutil, subprocess, sys
 output = pathlib.Path(sys.argv[sys.argv.index("-o") + 1])
 sha = hashlib.sha256(repr([word for word in sys.argv[1:] if word.startswith("-")]).encode())
-words = [word for word in sys.argv[1:] if word not in ("-o", str(output), "-shared")]
-sha.update(subprocess.run(["/usr/bin/gcc", "-E", "-P", *words], check=True, stdout=subprocess.PIPE).stdout)
+folders = {pathlib.Path(word).parent for word in sys.argv[1:] if word.endswith(".c")}
+for source in sorted(path for folder in folders for path in folder.glob("*.[ch]")):
+    code = re.sub(rb"//[^\n]*|/\*.*?\*/|\s+", b" ", source.read_bytes(), flags=re.DOTALL)
+    sha.update(source.name.encode() + code.strip())
 cached = pathlib.Path(__file__).with_name(sha.hexdigest())
 if not cached.exists():
     subprocess.run(["/usr/bin/gcc", *sys.argv[1:]], check=True)

@@ -1,4 +1,7 @@
-"""A catkin workspace with both packages: built, installed, and used from the install space only."""
+"""A catkin workspace with both packages: built, installed, and used from the install space only.
+
+Usually with a few requests of rosAFE: catkin starts several processes for each message. `scripts/test --long` has all.
+"""
 
 from __future__ import annotations
 
@@ -14,19 +17,22 @@ import pytest
 
 from rosafe import __version__
 from rosafe.component import generate
-from tests.harness import PYTHON, Graph, MasterProcess, wait_for
-from tests.packaging.clone import environment, fresh_copy, run
+from tests.harness import PYTHON, ROOT, Graph, MasterProcess, wait_for
+from tests.packaging.clone import environment, fresh_copy, keep_few_requests, run
 
 NEEDED = ("catkin_make", "cmake", "make", "cc")
+ALL = pytest.param("all", marks=pytest.mark.exploration)
 
 
-@pytest.fixture(scope="module")
-def workspace() -> Iterator[Path]:
+@pytest.fixture(scope="module", params=["few", ALL])
+def workspace(request: pytest.FixtureRequest) -> Iterator[Path]:
     """A workspace after ``catkin_make install``, whose sources have been moved away."""
     missing = [tool for tool in NEEDED if shutil.which(tool) is None]
     if missing or not Path("/usr/share/message_generation").exists():
         pytest.skip(f"no catkin here ({missing or 'message_generation'}); run scripts/install --tests")
     with fresh_copy() as copy:
+        if request.param == "few":
+            list_files(copy / "CMakeLists.txt", keep_few_requests(copy))
         folder = copy.with_name("workspace")
         sources = folder / "src"
         sources.mkdir(parents=True)
@@ -42,6 +48,19 @@ def workspace() -> Iterator[Path]:
         assert "CMake Warning" not in done.stderr.replace("CMake Deprecation Warning", ""), done.stderr
         copy.rename(copy.with_name("gone"))
         yield folder
+
+
+def definitions(checkout: Path) -> set[str]:
+    """Return the names of the requests and actions of rosAFE in a checkout."""
+    return {path.stem for kind in ("action", "srv") for path in (checkout / kind).iterdir()}
+
+
+def list_files(cmake: Path, removed: set[str]) -> None:
+    """Remove the names of deleted files from the lists in CMakeLists.txt."""
+    lines = cmake.read_text("utf-8").splitlines(keepends=True)
+    kept = [line for line in lines if line.strip() not in removed]
+    assert len(lines) - len(kept) == len(removed)
+    cmake.write_text("".join(kept), "utf-8")
 
 
 def sourced(workspace: Path, commands: str, shell: str = "bash", **env: str) -> subprocess.CompletedProcess[str]:
@@ -60,13 +79,15 @@ def printed(done: subprocess.CompletedProcess[str]) -> str:
 def test_messages_equal_those_of_our_generator(workspace: Path, package: str) -> None:
     """Byte for byte, including the messages of actions."""
     generation = Path(generate.environment()["ROS_PACKAGE_PATH"].split(":")[0]).parent
+    deleted = tuple(definitions(ROOT) - definitions(workspace.with_name("gone"))) if package == "rosAFE" else ()
     for kind in ("msg", "srv"):
         for own, catkin in (
             (generation / "python" / package / kind, workspace / "install/lib/python3/dist-packages" / package / kind),
             (generation / "share" / package / kind, workspace / "install/share" / package / kind),
         ):
-            names = sorted(p.name for p in own.iterdir() if p.is_file())
-            assert names == sorted(p.name for p in catkin.iterdir() if p.is_file())
+            expected = {p.name for p in own.iterdir() if p.is_file() and not p.name.lstrip("_").startswith(deleted)}
+            assert {p.name for p in catkin.iterdir() if p.is_file()} == expected
+            names = sorted(expected - ({"__init__.py"} if deleted else set()))  # __init__.py imports the others
             assert filecmp.cmpfiles(own, catkin, names, shallow=False) == (names, [], [])
 
 
@@ -131,6 +152,7 @@ def test_second_setup_has_no_effect(workspace: Path) -> None:
     assert printed(sourced(workspace, again)).strip() == str(workspace / "install" / "lib" / "tcltk")
 
 
+@pytest.mark.parametrize("workspace", [ALL], indirect=True)  # a node imports the messages of all requests
 def test_both_nodes_run_from_the_install_space(
     workspace: Path, private_graph: tuple[Graph, MasterProcess], tmp_path: Path
 ) -> None:

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import pytest
 
-from rosafe import missing
 from rosafe.component import generate
 from rosafe.version import VERSION
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, wait_for
@@ -23,8 +22,8 @@ from tests.packaging.clone import environment, fresh_copy, run
 
 NAMES = ("python3-rosafe", "rosafe")
 DATE = "1700000000"  # seconds; the packages do not depend on the time of the build
-NOT_AT_RUN_TIME = {"gcc", "libc6-dev", "python3-dev", "libasound2-dev", "ca-certificates"}  # of scripts/install
-NOT_AT_RUN_TIME |= {"python3-pip", "python3-setuptools", "python3-wheel"}
+
+pytestmark = pytest.mark.exploration  # a clean build takes long; test_debian_folder has what needs none
 
 
 def build(folder: Path) -> dict[str, Path]:
@@ -73,23 +72,23 @@ def field(package: Path, name: str) -> str:
     return done.stdout.strip()
 
 
-def array(text: str, name: str) -> set[str]:
-    """Return the words of the arrays `name` in a shell script, without comments."""
-    found = re.findall(rf"^{name}\+?=\((.*?)\)", text, re.MULTILINE | re.DOTALL)
-    assert found
-    return set(re.sub(r"#.*", "", " ".join(f"{part}\n" for part in found)).split())
+def assert_same_messages(python: Path, share: Path, package: str) -> None:
+    """Compare the messages of a package in these folders with those of the checkout."""
+    generation = Path(generate.environment()["ROS_PACKAGE_PATH"].split(":")[0]).parent
+    for kind in ("msg", "srv"):
+        for own, installed in (
+            (generation / "python" / package / kind, python / package / kind),
+            (generation / "share" / package / kind, share / package / kind),
+        ):
+            names = sorted(path.name for path in own.iterdir() if path.is_file())
+            assert names and names == sorted(path.name for path in installed.iterdir())
+            assert filecmp.cmpfiles(own, installed, names, shallow=False) == (names, [], [])
 
 
-def test_versions_and_dependencies(packages: dict[str, Path]) -> None:
-    """All packages of scripts/install are dependencies, except those that only builds need."""
-    depends = {name: field(path, "Depends") for name, path in packages.items()}
+def test_versions(packages: dict[str, Path]) -> None:
     for path in packages.values():
         assert re.fullmatch(re.escape(VERSION) + r"~[a-z]+[0-9.]*", field(path, "Version"))
-    assert f"python3-rosafe (= {field(packages['rosafe'], 'Version')})" in depends["rosafe"]
-    names = {re.split(r"[ :]", part.strip())[0] for text in depends.values() for part in re.split("[,|]", text)}
-    needed = array((ROOT / "scripts" / "install").read_text("utf-8"), "run") - NOT_AT_RUN_TIME
-    assert needed <= names
-    assert not {name for name in names if name.startswith(("ros-", "python3-ros"))} - needed - {"python3-rosafe"}
+    assert f"python3-rosafe (= {field(packages['rosafe'], 'Version')})" in field(packages["rosafe"], "Depends")
 
 
 def test_maintainer_scripts_remove_what_programs_create(packages: dict[str, Path], tmp_path: Path) -> None:
@@ -143,15 +142,7 @@ def test_each_command_has_a_manual_page(root: Path) -> None:
 
 @pytest.mark.parametrize("package", ["rosAFE", "bass"])
 def test_messages_equal_those_of_the_checkout(root: Path, package: str) -> None:
-    generation = Path(generate.environment()["ROS_PACKAGE_PATH"].split(":")[0]).parent
-    for kind in ("msg", "srv"):
-        for own, installed in (
-            (generation / "python" / package / kind, root / "usr/lib/python3/dist-packages" / package / kind),
-            (generation / "share" / package / kind, root / "usr/share" / package / kind),
-        ):
-            names = sorted(path.name for path in own.iterdir() if path.is_file())
-            assert names and names == sorted(path.name for path in installed.iterdir())
-            assert filecmp.cmpfiles(own, installed, names, shallow=False) == (names, [], [])
+    assert_same_messages(root / "usr/lib/python3/dist-packages", root / "usr/share", package)
 
 
 def test_doctor_finds_the_prebuilt_parts(root: Path, tmp_path: Path) -> None:
@@ -195,24 +186,6 @@ def test_nodes_run_from_the_packages(root: Path, private_graph: tuple[Graph, Mas
     assert {path.name for path in home.iterdir()} <= {"log"}
 
 
-@pytest.mark.exploration
 def test_two_builds_are_equal(packages: dict[str, Path], tmp_path: Path) -> None:
     for name, path in build(tmp_path).items():
         assert filecmp.cmp(path, packages[name], shallow=False), name
-
-
-@pytest.mark.parametrize("arguments", [["-x"], ["--folder"], ["a", "b"]])
-def test_wrong_arguments(arguments: list[str]) -> None:
-    done = run(ROOT / "scripts" / "make-deb", *arguments, env=environment())
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("usage: scripts/make-deb [FOLDER]")
-
-
-def test_advice_about_missing_packages_names_those_of_debian(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`apt install rosafe` would fail: Debian does not have that package."""
-    assert missing.install("matplotlib") == missing.install("rospy") == "run scripts/install"
-    monkeypatch.setattr(missing, "_DEBIAN_DIR", ROOT)
-    assert missing.install("matplotlib.pyplot") == "apt install python3-matplotlib"
-    assert {missing.install(name) for name in ("rospy", "aiohttp", "tkinter", "bass.msg")} == {
-        "install the Debian package rosafe"
-    }

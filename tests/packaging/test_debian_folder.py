@@ -1,0 +1,58 @@
+"""The Debian packages, without a build: dependencies, messages, and arguments of scripts/make-deb."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from rosafe import missing
+from tests.harness import PYTHON, ROOT
+from tests.packaging.clone import environment, run
+from tests.packaging.test_deb import assert_same_messages
+
+NOT_AT_RUN_TIME = {"gcc", "libc6-dev", "python3-dev", "libasound2-dev", "ca-certificates"}  # of scripts/install
+NOT_AT_RUN_TIME |= {"python3-pip", "python3-setuptools", "python3-wheel"}
+
+
+def array(text: str, name: str) -> set[str]:
+    """Return the words of the arrays `name` in a shell script, without comments."""
+    found = re.findall(rf"^{name}\+?=\((.*?)\)", text, re.MULTILINE | re.DOTALL)
+    assert found
+    return set(re.sub(r"#.*", "", " ".join(f"{part}\n" for part in found)).split())
+
+
+def test_dependencies() -> None:
+    """All packages of scripts/install are dependencies, except those that only builds need."""
+    packages = (ROOT / "debian" / "control").read_text("utf-8").partition("\nPackage: ")[2]
+    lists = re.findall(r"^Depends:\n((?: .*\n)+)", packages, re.MULTILINE)
+    names = set(re.findall(r"^ ([a-z][a-z0-9.-]+)", "".join(lists), re.MULTILINE))
+    needed = array((ROOT / "scripts" / "install").read_text("utf-8"), "run") - NOT_AT_RUN_TIME
+    assert len(lists) == 2 and needed <= names
+    assert not {name for name in names if name.startswith(("ros-", "python3-ros"))} - needed - {"python3-rosafe"}
+
+
+def test_messages_equal_those_of_the_checkout(tmp_path: Path) -> None:
+    done = run(PYTHON, "-m", "debian.messages", tmp_path, env=environment(PYTHONPATH=str(ROOT)))
+    assert done.returncode == 0, done.stderr
+    for package in ("rosAFE", "bass"):
+        assert_same_messages(tmp_path / "python", tmp_path / "share", package)
+        assert not [path for path in (tmp_path / "share" / package).rglob("*") if path.is_symlink()]
+
+
+@pytest.mark.parametrize("arguments", [["-x"], ["--folder"], ["a", "b"]])
+def test_wrong_arguments(arguments: list[str]) -> None:
+    done = run(ROOT / "scripts" / "make-deb", *arguments, env=environment())
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("usage: scripts/make-deb [FOLDER]")
+
+
+def test_advice_about_missing_packages_names_those_of_debian(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`apt install rosafe` would fail: Debian does not have that package."""
+    assert missing.install("matplotlib") == missing.install("rospy") == "run scripts/install"
+    monkeypatch.setattr(missing, "_DEBIAN_DIR", ROOT)
+    assert missing.install("matplotlib.pyplot") == "apt install python3-matplotlib"
+    assert {missing.install(name) for name in ("rospy", "aiohttp", "tkinter", "bass.msg")} == {
+        "install the Debian package rosafe"
+    }
