@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import importlib
 import threading
-from collections.abc import Iterator
 from typing import Any, cast
 
 import rospy
@@ -72,6 +71,7 @@ class BassNode:
         # All steps that can fail precede the end of the running acquisition, so that an error does not stop it.
         source = self._open(activity, device, values["sampleRate"], frames_per_chunk)
         try:
+            truth = self._truth_of(source)
             capture = Capture(source, frames_per_chunk, chunks, self._publish, self._note_loss)
             activity.interrupt_others()
             activity.raise_if_interrupted()
@@ -79,7 +79,7 @@ class BassNode:
             capture.publish()
             rospy.loginfo(f"acquiring from {device} at {source.sample_rate} Hz")
             activity.running()
-            with self._truth_of(source):
+            with truth:
                 capture.run(activity.stop_requested, self._node.meters["capture"].cycle)
             self._last_end = f"{device}: {'stopped' if activity.stop_requested.is_set() else 'end of the source'}"
             rospy.loginfo(f"the acquisition has ended: {self._last_end}")
@@ -93,22 +93,17 @@ class BassNode:
                 self._source = None
             source.close()
 
-    @contextlib.contextmanager
-    def _truth_of(self, source: SoundSource) -> Iterator[None]:
-        """Publish the true directions of a scene while it runs."""
+    def _truth_of(self, source: SoundSource) -> contextlib.AbstractContextManager[object]:
+        """Return a context in which the true directions of a scene are published; ComponentError for wrong names."""
         if not hasattr(source, "truth"):
-            yield
-            return
+            return contextlib.nullcontext()
         frames: tuple[str, ...] = ("world", "head")
         with contextlib.suppress(*master.FAILURES):  # without a master, the defaults
             # tf2 has no leading slash
             frames = tuple(str(rospy.get_param(f"~{name}_frame", name)).strip("/") or name for name in frames)
-        publisher = TruthPublisher(cast(TruthSource, source), self._truth, self._truth_class, frames)
-        publisher.start()
-        try:
-            yield
-        finally:
-            publisher.stop()
+        if frames[0] == frames[1]:
+            raise BASS.error("e_hwparams", f"world_frame: expected another frame than head_frame, got {frames[0]!r}")
+        return TruthPublisher(cast(TruthSource, source), self._truth, self._truth_class, frames)
 
     def _open(self, activity: Activity, device: str, sample_rate: int, frames_per_chunk: int) -> SoundSource:
         try:

@@ -56,11 +56,11 @@ class TruthPublisher:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="scene truth", daemon=True)
 
-    def start(self) -> None:
+    def __enter__(self) -> None:
         """Begin to publish; the first message follows the first frame of the source."""
         self._thread.start()
 
-    def stop(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """End, and take the transform back."""
         self._stopping.set()
         self._thread.join()

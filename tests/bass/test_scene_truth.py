@@ -76,6 +76,21 @@ def test_names_of_coordinate_frames(
     assert (transform.header.frame_id, transform.child_frame_id) == expected
 
 
+def test_equal_names_of_coordinate_frames_are_an_error(graph: Graph, bass_node: Process) -> None:
+    """A transform from a coordinate frame to itself is not valid. The running acquisition continues."""
+    graph.client()
+    graph.call("/bass/Acquire", device="scene:", sampleRate=8000, nFramesPerChunk=400, nChunksOnPort=4)
+    rospy.set_param("/bass/world_frame", "/head")
+    try:
+        answer = graph.call("/bass/Acquire", device="scene:", sampleRate=8000, nFramesPerChunk=800, nChunksOnPort=4)
+    finally:
+        rospy.delete_param("/bass/world_frame")
+    assert not answer.genom_success
+    assert "world_frame: expected another frame than head_frame, got 'head'" in answer.genom_exdetail
+    assert graph.call("/bass/getAcquisition").nFramesPerChunk == 400
+    graph.call("/bass/Stop")
+
+
 def test_the_built_in_scene_has_a_truth(graph: Graph, bass_node: Process) -> None:
     message_class = importlib.import_module("bass.msg").SceneTruth
     with graph.collect("/bass/sceneTruth", message_class) as truths:
