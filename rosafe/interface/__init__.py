@@ -26,6 +26,7 @@ from .rosafe import (
     MAX_SECONDS,
     MAX_SETUP,
     REQUEST,
+    RESTORED_PARAM,
     ROSAFE,
     SAVE_SETUP,
 )
@@ -62,6 +63,7 @@ __all__ = [
     "PROBLEMS",
     "REQUEST",
     "REQUIRED",
+    "RESTORED_PARAM",
     "ROSAFE",
     "SAVE_SETUP",
     "ComponentError",

@@ -19,6 +19,7 @@ from .service import ComponentSpec, PortSpec, Service, Struct
 
 MAX_SECONDS = 600.0  # of a port or history
 MAX_SETUP = 4 * 2**20  # characters of a setup; over HTTP, the URL length is the lower limit
+RESTORED_PARAM = "restored"  # private ROS parameter: address of the node and the processors that it restores (`--keep`)
 MAX_PARAMETERS = 2**18  # characters of the parameters of a request for a whole tree, as a ROS service
 
 Kinds = Mapping[str, Representation]  # parents first

@@ -9,6 +9,7 @@ import rospy
 
 from rosafe.client.component_client import ComponentClient
 from rosafe.client.graph import Graph, NotRegisteredError
+from rosafe.interface import RESTORED_PARAM
 from rosafe.tree import tree_builder
 
 
@@ -30,14 +31,20 @@ class CreatedProcessors:
         self.node = ""
         self._parameter = rospy.resolve_name("~created")
 
-    async def recall(self, graph: Graph, node: str) -> None:
-        """Read the parameter if rosAFE at the address `node` is another one than before."""
-        if node != self.node:
-            self.node, self.names = node, []
-            with contextlib.suppress(NotRegisteredError):
-                kept = await graph.master("getParam", self._parameter)
-                if isinstance(kept, list) and kept[:1] == [node]:
-                    self.names = [str(name) for name in kept[1:]]
+    async def recall(self, graph: Graph, instance: str, node: str) -> None:
+        """Read the parameter if rosAFE at the address `node` is another one than before.
+
+        The processors of the rosAFE before it exist again if it has restored its tree (`rosAFE-ros --keep`).
+        """
+        if node == self.node:
+            return
+        stored = await _list_parameter(graph, self._parameter)
+        names = stored[1:] or self.names
+        if stored[:1] != [node]:
+            restored = await _list_parameter(graph, f"/{instance}/{RESTORED_PARAM}")
+            names = [name for name in names if restored[:1] == [node] and name in restored[1:]]
+        self.node, self.names = node, []
+        await self._set(graph, names)
 
     async def add(self, graph: Graph, names: Iterable[str]) -> None:
         """Add processors."""
@@ -61,3 +68,12 @@ class CreatedProcessors:
         if not self.names:
             with contextlib.suppress(NotRegisteredError):
                 await graph.master("deleteParam", self._parameter)
+
+
+async def _list_parameter(graph: Graph, name: str) -> list[str]:
+    """Return a ROS parameter that is a list of texts; empty if there is none."""
+    try:
+        value = await graph.master("getParam", name)
+    except NotRegisteredError:
+        return []
+    return [str(item) for item in value] if isinstance(value, list) else []

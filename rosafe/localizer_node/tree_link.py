@@ -195,8 +195,9 @@ class TreeLink:
             node = await graph.node_uri(self._instance)
         except NotRegisteredError:  # it ends, or the master has restarted
             raise _Waiting(f"waiting for rosAFE: /{self._instance} is not registered at the master") from None
-        await self._created.recall(graph, node)
-        await self._created.keep(graph, (p.name for p in await tree_builder.list_processors(client)))
+        await self._created.recall(graph, self._instance, node)
+        if processors := await tree_builder.list_processors(client):  # otherwise a tree may still be restored
+            await self._created.keep(graph, (processor.name for processor in processors))
 
     async def _establish(self, graph: Graph, client: ComponentClient) -> Link:
         service = ServiceClient(graph, ROSAFE.name, self._instance, "request")
@@ -229,6 +230,8 @@ class TreeLink:
             root = _input_of(await tree_builder.list_processors(client))
             if root is None:
                 model = await self._model(await self._wait_for_sound(client))
+                if await tree_builder.list_processors(client):  # meanwhile: a tree was restored
+                    continue
                 hop = FrameGrid.design(model.sample_rate, "cc", model.parameters).hop
                 frames = hop * max(1, round(BLOCK_SECONDS * model.sample_rate / hop))
                 await self._request(graph, service, "input", {"nFramesPerBlock": frames})

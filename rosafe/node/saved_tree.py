@@ -11,7 +11,7 @@ import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.component.activities import Activities, Handler
-from rosafe.interface import ROSAFE, ComponentError, Representation
+from rosafe.interface import RESTORED_PARAM, ROSAFE, ComponentError, Representation
 from rosafe.node.audio_input import AudioInput
 from rosafe.node.tree_state_file import TreeStateFile
 from rosafe.setups import Setup, SetupProcessor, dry_run
@@ -90,6 +90,8 @@ class SavedTree:
             self._audio.connect(topic)  # it need not have a publisher yet
             self.save()
         if self._pending.processors:
+            names = [processor.name for processor in self._pending.processors]
+            rospy.set_param(f"~{RESTORED_PARAM}", [rospy.get_node_uri(), *names])  # for clients that know the names
             self._waiting_for = f"waiting for sound on {topic or 'the Audio port'}"
             threading.Thread(target=self._restore, args=(finished,), name="restore tree", daemon=True).start()
 
