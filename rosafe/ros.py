@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 import time
 from collections import deque
 from typing import Any, NamedTuple
 
 MAX_LINES = 600  # lines of a FrameClock: at least two minutes with the default block
+MAX_RATE = 1_000_000.0  # Hz
+MAX_TIME = 2.0**32 - 86400  # s since 1970; the time of a ROS message ends a day later
+MAX_SKEW = 1e-3  # relative, of the measured rate of a sound card
+_LINE = struct.Struct("<IIQd")  # a message: the stamp in s and ns, the frame index, the measured sample rate
 
 
 def array_msg(generated: Any) -> Any:
@@ -55,6 +60,11 @@ class FrameClock:
     ----------
     node : str
         The name of the node.
+
+    Attributes
+    ----------
+    problem : str
+        Why the last message was ignored; empty if it was not.
     """
 
     def __init__(self, node: str = "rosAFE") -> None:
@@ -66,10 +76,13 @@ class FrameClock:
         from rosAFE.msg import rosAFE_frameTime
 
         self.topic = f"{node}/frameTime"
+        self.problem = ""
         self._lines: deque[_Line] = deque(maxlen=MAX_LINES)
         self._arrived = threading.Condition()
         self._rospy = rospy
-        self._subscriber = rospy.Subscriber(self.topic, rosAFE_frameTime, self._take, queue_size=100, tcp_nodelay=True)
+        members = {"__init__": lambda message: None, "deserialize": _keep_bytes}
+        message_class = type("frameTime", (rosAFE_frameTime,), members)
+        self._subscriber = rospy.Subscriber(self.topic, message_class, self._take, queue_size=100, tcp_nodelay=True)
 
     def close(self) -> None:
         """Unsubscribe."""
@@ -135,20 +148,49 @@ class FrameClock:
             return self.time(newest - back)
         with self._arrived:
             lines = list(self._lines)[-2:]
-        rate = lines[-1].rate if lines else 0.0
-        width, step = round(window * rate), max(1, round(hop * rate))
+        rate = _nominal(lines[-1].rate) if lines else 0.0
+        width, step = 2 * _whole(window * rate / 2), max(1, _whole(hop * rate))  # as in `rosafe.dsp.framing`
         block = lines[-1].frame - lines[0].frame if len(lines) > 1 else 0
         left_over = -width % step if block > 0 and block % step == 0 else step / 2  # samples after the newest frame
         return self.time(newest + 1 - left_over - back * step - width / 2)
 
     def _take(self, message: Any) -> None:
-        wall = message.stamp.to_sec()
+        self.problem = self._add(message.data)
+
+    def _add(self, data: bytes) -> str:
+        """Add the line of a message; return a problem if it is malformed, or an empty string."""
+        if len(data) != _LINE.size:
+            return f"{self.topic}: expected {_LINE.size} bytes, got {len(data)}"
+        seconds, nanoseconds, frame, rate = _LINE.unpack(data)
+        wall = seconds + 1e-9 * nanoseconds
+        if not 1 <= rate <= MAX_RATE:  # NaN is not
+            return f"{self.topic}: sampleRate: expected a number from 1 to {MAX_RATE:g} Hz, got {rate:g}"
+        if wall >= MAX_TIME:
+            return f"{self.topic}: stamp: expected a time below {MAX_TIME:.0f} s, got {wall:.0f}"
         now, ros_now = time.time(), self._rospy.get_time()
         # Stamps from rosbag play are ROS time; stamps from capture are wall-clock time.
         recorded = abs(wall - ros_now) <= abs(wall - now)
-        line = _Line(int(message.frameIndex), wall, float(message.sampleRate), 0.0 if recorded else ros_now - now)
+        line = _Line(frame, wall, rate, 0.0 if recorded else ros_now - now)
         with self._arrived:
             if self._lines and line.frame <= self._lines[-1].frame:  # a new stream
                 self._lines.clear()
             self._lines.append(line)
             self._arrived.notify_all()
+        return ""
+
+
+def _keep_bytes(message: Any, data: bytes) -> Any:
+    """Leave a message undecoded. Decoding it with the generated class takes most of the time of its arrival."""
+    message.data = data
+    return message
+
+
+def _whole(samples: float) -> int:
+    """Return a number of samples, rounded half up."""
+    return int(samples + 0.5)
+
+
+def _nominal(rate: float) -> float:
+    """Return the nominal sample rate (Hz) for a measured one: a usual one if it is near, otherwise a whole number."""
+    usual = min((step * round(rate / step) for step in (1000, 11025)), key=lambda other: abs(other - rate))
+    return float(usual if abs(usual / rate - 1) < MAX_SKEW else round(rate))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -161,6 +162,56 @@ def test_a_client_computes_the_time_of_a_frame_of_any_port(afe: Session, stamped
     with pytest.raises(LookupError, match="frame: expected"):
         clock.of(ild, 100_000)
     clock.close()
+
+
+@pytest.fixture
+def published(graph: Graph) -> Iterator[tuple[FrameClock, Callable[..., None]]]:
+    """Return a clock, and a function that publishes a time of a frame for it."""
+    graph.client()
+    clock = FrameClock("/other")
+    publisher = rospy.Publisher("/other/frameTime", rosAFE_frameTime, queue_size=10)
+    wait_for(lambda: publisher.get_num_connections())
+
+    def publish(frame: int, rate: float, seconds: float = 1.7e9) -> None:
+        publisher.publish(stamp=rospy.Time.from_sec(seconds), frameIndex=frame, sampleRate=rate)
+
+    yield clock, publish
+    clock.close()
+    publisher.unregister()
+
+
+def test_a_sound_card_that_runs_slightly_fast(published: tuple[FrameClock, Callable[..., None]]) -> None:
+    """The lengths of frames are those of the nominal sample rate."""
+    clock, publish = published
+    rate = 44100 * (1 + 4e-4)
+    publish(441_000, rate)
+    publish(445_410, rate, 1.7e9 + 4410 / rate)  # the hop of 441 frames divides the block
+    wait_for(lambda: len(clock._lines) == 2)
+    frame = SimpleNamespace(lastFrameIndex=445_411, framesOnPort=10)
+    for window, samples, left_over in ((0.5, 22_050, 0), (0.03, 1324, 440), (0.02, 882, 0)):
+        middle = clock.of(frame, window=window, hop=0.01).wall
+        expected = 445_411 - left_over - samples / 2
+        assert middle - clock.time(expected).wall == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rate", "seconds", "problem"),
+    [
+        *((rate, 1.7e9, "sampleRate: expected a number from 1 to") for rate in (0.0, -1.0, 1e300, math.inf, math.nan)),
+        (44100.0, 2.0**32 - 10, "stamp: expected a time below"),
+    ],
+)
+def test_times_that_are_not_valid(
+    published: tuple[FrameClock, Callable[..., None]], rate: float, seconds: float, problem: str
+) -> None:
+    clock, publish = published
+    publish(1000, rate, seconds)
+    wait_for(lambda: clock.problem)
+    assert clock.problem.startswith(f"/other/frameTime: {problem}")
+    assert not clock.covers(1000, 1e9)
+    publish(1000, 44100.0)
+    wait_for(lambda: clock.covers(1000, 1))
+    assert not clock.problem
 
 
 def test_tcl_and_matlab_read_the_time(afe: Session, stamped: Stamped) -> None:
