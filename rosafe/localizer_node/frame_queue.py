@@ -43,6 +43,10 @@ class FrameQueue:
         """Whether the robot speaks."""
         return self._mute.active
 
+    def __len__(self) -> int:
+        """The number of frames that wait."""
+        return sum(len(frames.middles) for frames in self._waiting)
+
     def clear(self) -> None:
         """Drop all frames."""
         self._waiting.clear()
@@ -54,7 +58,7 @@ class FrameQueue:
 
     def take(self, least: int) -> TurnedFrames | None:
         """Return all frames whose rotation is known; None if these are none, or if less than `least` frames wait."""
-        if sum(len(frames.middles) for frames in self._waiting) < least:
+        if len(self) < least:
             return None
         joined = NewFrames.joined(self._waiting)
         yaw, known = self._rotation.lookup(joined.middles)

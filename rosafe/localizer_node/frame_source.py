@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import struct
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +21,7 @@ from rosafe.sound.windows import MAX_INDEX, new_frames
 
 READ_BYTES = 2**17  # per read of a subscriber
 KEPT_MESSAGES = 8  # of each port, until the other ports have the same block
+_HEAD = struct.Struct("<IQQ")  # the beginning of a message: sampleRate, lastFrameIndex, framesOnPort
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,22 @@ class StreamRestartedError(Exception):
     """The index of the stream has fallen; the text says from where to where."""
 
 
+class _Undecoded:
+    """A message with the received bytes in `data`: most messages are replaced by newer ones before they are used."""
+
+    def deserialize(self, data: Any) -> Any:
+        self.data = data
+        return self
+
+    def decode(self) -> Any:
+        return super().deserialize(self.data)  # type: ignore[misc]  # of the message class
+
+
+@functools.cache
+def _message_class(idl: str) -> Any:
+    return type("Message", (_Undecoded, serialization.tolerant_message_class("rosAFE", idl)), {})
+
+
 class _Port:
     """The messages of one port. All methods but `close` need the lock of the source."""
 
@@ -90,14 +109,19 @@ class _Port:
         self.kind = kind
         self.problem = ""
         self.messages: dict[int, Any] = {}  # the newest, by lastFrameIndex
+        self.window = 0  # samples for which the newest message has frames
         self.count = 0  # frames from the first block that was used to the end of the last one
         self._format = format_
         self._source = source
         self._newest = 0
         self._used: Any = None
-        message_class = serialization.tolerant_message_class("rosAFE", LAYOUTS[kind].idl)
         self._subscriber = rospy.Subscriber(
-            topic, message_class, self._receive, queue_size=KEPT_MESSAGES, buff_size=READ_BYTES, tcp_nodelay=True
+            topic,
+            _message_class(LAYOUTS[kind].idl),
+            self._receive,
+            queue_size=KEPT_MESSAGES,
+            buff_size=READ_BYTES,
+            tcp_nodelay=True,
         )
 
     def close(self) -> None:
@@ -106,26 +130,37 @@ class _Port:
 
     def _receive(self, message: Any) -> None:
         with self._source.lock:
-            self._take(message)
-            complete = bool(self.problem) or self._source.has_block()
-        if complete:
+            self._keep(message)
+            ready = bool(self.problem) or self._source.is_ready()
+        if ready:
             self._source.received()
 
-    def _take(self, message: Any) -> None:
-        index = int(message.lastFrameIndex)
-        self.problem = message.problem or self._malformed(message, index)
-        if self.problem or not index:  # 0: a processor that has just started
+    def _keep(self, message: Any) -> None:
+        if len(message.data) < _HEAD.size:
+            self.problem = f"{self.kind}: expected at least {_HEAD.size} bytes, got {len(message.data)}"
+            return
+        _, index, frames = _HEAD.unpack_from(message.data)
+        if index >= MAX_INDEX:
+            self.problem = f"{self.kind}: lastFrameIndex {index} is out of range"
+            return
+        if not index:  # a processor that has just started
             return
         if index < self._newest:  # another stream
             self.messages.clear()
-        self._newest = index
+        self._newest, self.window = index, frames * self._format.hop
         while len(self.messages) >= KEPT_MESSAGES:
             self.messages.pop(next(iter(self.messages)))
         self.messages[index] = message
 
-    def _malformed(self, message: Any, index: int) -> str:
-        if index >= MAX_INDEX:
-            return f"{self.kind}: lastFrameIndex {index} is out of range"
+    def decode(self, index: int) -> bool:
+        """Decode the message of a block; return whether it can be used. Otherwise it is dropped."""
+        message = self.messages[index].decode()
+        self.problem = message.problem or self._malformed(message)
+        if self.problem:
+            del self.messages[index]
+        return not self.problem
+
+    def _malformed(self, message: Any) -> str:
         for samples in (message.left, message.right) if self.kind == "ratemap" else (message.left,):
             shape = getattr(samples, "shape", ("of several lengths",))
             if shape != (self._format.channels, message.framesOnPort) or not message.framesOnPort:
@@ -169,7 +204,12 @@ class FrameSource:
     clock : FrameClock
         Of the rosAFE node.
     received : callable
-        Called when all ports have a new block, on rospy's threads.
+        Called when `take` returns frames, on rospy's threads.
+
+    Attributes
+    ----------
+    least : int
+        Samples of new sound for which `take` waits, unless the ports are shorter.
     """
 
     def __init__(
@@ -177,6 +217,7 @@ class FrameSource:
     ) -> None:
         self.format = format_
         self.received = received
+        self.least = 0
         self.lock = threading.Lock()
         self._clock = clock
         self._index = 0  # block that was used last
@@ -193,16 +234,23 @@ class FrameSource:
 
     @property
     def problem(self) -> str:
-        """Why the messages of a port cannot be used; empty if they can."""
-        return next((port.problem for port in self._ports if port.problem), "")
+        """Why messages cannot be used; empty if they can."""
+        return next((port.problem for port in self._ports if port.problem), self._clock.problem)
 
-    def has_block(self) -> bool:
-        """Return whether a block of all ports has arrived since the last one was used. Needs the lock."""
+    def _newest_block(self) -> int:
+        """Return the newest block that all ports have; 0 if there is none."""
         first, *others = (port.messages for port in self._ports)
-        return any(all(index in messages for messages in others) for index in first)
+        return max((index for index in first if all(index in messages for messages in others)), default=0)
+
+    def is_ready(self) -> bool:
+        """Return whether there are enough new blocks. Needs the lock."""
+        newest = self._newest_block()
+        new = newest - self._index
+        enough = new <= 0 or new >= self.least or new + self.format.block > min(port.window for port in self._ports)
+        return newest > 0 and enough
 
     def take(self) -> NewFrames | None:
-        """Return the frames since the last call; None if there are none, or their times are not known yet.
+        """Return the frames since the last call; None if they are not enough, or their times are not known yet.
 
         The first call after messages have arrived returns none: frames are counted from there.
 
@@ -212,10 +260,12 @@ class FrameSource:
             Another stream has started; the next call continues with it.
         """
         with self.lock:
-            common = set.intersection(*(set(port.messages) for port in self._ports))
-            if not common or not self._clock.covers(max(common) - 1, self.format.sample_rate):
+            newest = self._newest_block()
+            if not self.is_ready() or not self._clock.covers(newest - 1, self.format.sample_rate):
                 return None
-            before, self._index = self._index, max(common)
+            if not all(port.decode(newest) for port in self._ports):
+                return None
+            before, self._index = self._index, newest
             restarted = self._index <= before
             if not before or restarted:
                 self._first, self._done, self._end = self._index, 0, self._index - 1 - self.format.rest

@@ -149,18 +149,20 @@ class LocalizationLoop:
         source, localizer = self._source, self._localizer
         if source is None or localizer is None:
             return False
-        if source.problem:
-            self._status.set("frames", WARN, f"messages of rosAFE cannot be used: {source.problem}")
-            self._suspicious()
+        least = round(UPDATE_SECONDS / localizer.hop)
         try:
             new = source.take()
         except StreamRestartedError as restart:
             rospy.logwarn(f"a new stream of sound: {restart}; localization begins again")
             self._begin_again()
             return False
+        if source.problem:
+            self._status.set("frames", WARN, f"messages of rosAFE cannot be used: {source.problem}")
+            self._suspicious()
         if new is not None:
             self._append(new, localizer)
-        used = self._queue.take(round(UPDATE_SECONDS / localizer.hop))
+        used = self._queue.take(least)
+        source.least = max(0, least - len(self._queue)) * source.format.hop
         if used is None:
             return False
         middles = used.frames.middles

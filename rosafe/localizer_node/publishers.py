@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import rospy
 
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization.tracker import FORGOTTEN, PRESENT, Track
-from rosafe.transport.publisher import Publisher
+from rosafe.transport.publisher import NewestMessage, Publisher
 
 
 class Publishers:
@@ -53,17 +53,22 @@ class Publishers:
         estimate : tuple of ndarray
             The grid in degrees and the posterior.
         """
-        azimuths, posterior = estimate
+        stamp = ros_time(time)
         named = [track for track in tracks if track.id and track.probability >= FORGOTTEN]
         self._last_id = max([self._last_id, *(self._first_id + track.id for track in named)])
         sources = [self._source(track, gain_db) for track in named]
-        poses = [self._pose(track) for track in named if track.probability > PRESENT]
-        self._sources.publish(self._sources.data_class(self._header(time), sources))
-        self._poses.publish(self._poses.data_class(self._header(time), poses))
-        self._posterior.publish(self._posterior.data_class(self._header(time), np.radians(azimuths), posterior))
+        present = [track.azimuth for track in named if track.probability > PRESENT]
+        self._publish(self._sources, stamp, lambda: (sources,))
+        self._publish(self._poses, stamp, lambda: ([self._pose(azimuth) for azimuth in present],))
+        self._publish(self._posterior, stamp, lambda: (np.radians(estimate[0]), estimate[1]))
 
-    def _header(self, time: float) -> Any:
-        return self._header_class(stamp=ros_time(time), frame_id=self._frame_id)
+    def _publish(self, topic: Publisher, stamp: rospy.Time, members: Callable[[], tuple[Any, ...]]) -> None:
+        """Publish a message with a header and `members`, which are computed only for subscribers."""
+
+        def build() -> Any:
+            return topic.data_class(self._header_class(stamp=stamp, frame_id=self._frame_id), *members())
+
+        topic.publish_newest(NewestMessage(build))
 
     def _source(self, track: Track, gain_db: float) -> Any:
         return self._source_class(
@@ -76,9 +81,9 @@ class Publishers:
             last_seen=ros_time(track.last_time),
         )
 
-    def _pose(self, track: Track) -> Any:
+    def _pose(self, azimuth: float) -> Any:
         pose = self._pose_class()
-        half = math.radians(track.azimuth) / 2
+        half = math.radians(azimuth) / 2
         pose.orientation.z, pose.orientation.w = math.sin(half), math.cos(half)
         return pose
 
