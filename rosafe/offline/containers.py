@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from rosafe.offline.isolated import MAX_TEXT, blocks
-from rosafe.offline.memory import refuse_over_available
+from rosafe.offline.memory import LESS, refuse_over_available
 from rosafe.offline.result_metadata import is_scalar, new_array, parse_metadata, restored
 
 STALL = 10  # seconds without output of the child process, after which the file counts as damaged
@@ -82,7 +82,7 @@ def _take(child: subprocess.Popen[bytes]) -> tuple[dict[str, Any], Arrays]:
     try:
         head = json.loads(pipe.read(int.from_bytes(pipe.read(8), "little")))
         arrays = head["arrays"]
-        refuse_over_available(sum(math.prod(one["shape"], start=8.0) for one in arrays), "its arrays")
+        refuse_over_available(sum(math.prod(one["shape"], start=8.0) for one in arrays), "its arrays", LESS)
         return head["attributes"], {one["name"]: (pipe.array(one), one["attributes"]) for one in arrays}
     except _ChildEnded:
         raise ValueError(pipe.end()) from None

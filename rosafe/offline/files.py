@@ -30,10 +30,6 @@ from rosafe.version import VERSION
 OUTPUTS = ("ild", "ratemap", "crossCorrelation")  # the default: framed outputs of the original
 _MONO_ADVICE = "--channels 1,1 uses it for both, and --outputs ratemap needs one"
 _OPTIONS = ("channels", "topic", "pad", "clip")  # entries of a file that may be absent
-_TOO_LARGE = (
-    "one block of output would take {taken:.1f} GB, more than the limit of {limit:.1f} GB; "
-    "take fewer channels or lags, or a smaller --block"
-)
 
 
 class FileResult(NamedTuple):
@@ -205,7 +201,8 @@ class _FileRun:
         ears = computed_ears(sound.channels, kinds)
         with Chain(self._blocks(ears), sound.sample_rate, self._values, kinds, self._write, ears=ears) as chain:
             kind, taken = chain.largest_block(min(self._about["block_frames"], sound.frames))
-            sizes.check_memory(sizes.MAX_BYTES, taken, f"{kind}: {_TOO_LARGE}", 1e9)  # several exist at a time
+            advice = "take fewer channels or lags, or a smaller --block"
+            sizes.check_memory(kind, sizes.MAX_BYTES, taken, advice, content="one block")  # several exist at a time
             self._padding = chain.padding(sound.frames) if "pad" in self._about else 0
             contents = self._contents(chain)
             writer_class = self._format.writer(contents)
@@ -266,5 +263,6 @@ def _check_disk_space(path: Path, size: int) -> None:
     free = disk.f_bavail * disk.f_frsize
     if size > free:
         raise OutputError(
-            f"the output would take {bytes_text(size)}, but only {bytes_text(free)} are free; name fewer --outputs"
+            f"output: expected at most {bytes_text(free)} (free on the disk), got {bytes_text(size)}; "
+            "name fewer --outputs"
         )

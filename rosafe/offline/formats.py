@@ -144,7 +144,7 @@ def load(path: str | os.PathLike[str]) -> Result:
     try:
         _check_arrays(result)
     except ValueError as problem:
-        raise ValueError(f"{path}: expected a result of rosafe process, got a damaged one: {problem}") from None
+        raise _damaged(path, problem) from None
     for kind in KINDS.values():  # times of samples are not stored
         stored = [name for name in kind.outputs if name in result["axes"]]
         if stored and f"{kind.kind}_time" not in result:
@@ -217,14 +217,14 @@ def _check_outputs(kind: Representation, result: Mapping[str, Any]) -> None:
     if outputs and time in result:
         _check_array(time, result[time], 1)
         if any(result[name].shape[-1] != len(result[time]) for name in outputs):
-            raise ValueError(f"{time}: its length is not that of {outputs[0]}")
+            raise ValueError(f"{time}: expected the length of {outputs[0]}, got {len(result[time])}")
 
 
 def _check_coordinates(kind: Representation, result: Mapping[str, Any]) -> None:
     """Raise ValueError if the frame rate or a coordinate of a kind does not match its declaration."""
     rate = result.get(f"{kind.kind}_frameRate", 1.0)
     if not is_number(rate) or not 0 < rate < math.inf:
-        raise ValueError(f"{kind.kind}_frameRate: expected a positive number")
+        raise ValueError(f"{kind.kind}_frameRate: expected a positive number, got {short_repr(rate)}")
     units = {one.name: one.unit for one in kind.parameters} | {one.name: one.unit for one in kind.derived}
     for name in kind.coordinates:
         if units[name]:
@@ -240,6 +240,12 @@ def _check_array(name: str, value: Any, dimensions: int) -> None:
         raise ValueError(f"{short_repr(name)}: expected {dimensions} axes, got the shape {value.shape}")
 
 
+def _damaged(path: str | os.PathLike[str], reason: object) -> ValueError:
+    return ValueError(
+        f"{path}: expected a result of rosafe process, got another or damaged file: {reason}; compute the result again"
+    )
+
+
 def read(file_format: Format, path: Path, arrays: bool = True) -> dict[str, Any]:
     """Return the contents of a file; without `arrays`, only the metadata. Raises the errors of `load`."""
     if not path.exists():
@@ -253,10 +259,8 @@ def read(file_format: Format, path: Path, arrays: bool = True) -> dict[str, Any]
     try:
         result = checked(file_format.read(path, arrays))
     except (ValueError, OverflowError, RecursionError, MemoryError) as problem:  # json.JSONDecodeError, too
-        raise ValueError(
-            f"{path}: expected a result of rosafe process, got another or damaged file: {problem}"
-        ) from None
+        raise _damaged(path, problem) from None
     for name in ("axes", "parameters", "sample_rate"):
         if name not in result:
-            raise ValueError(f"{path}: expected a result of rosafe process, got a file without {name}")
+            raise _damaged(path, f"it lacks {name}")
     return result

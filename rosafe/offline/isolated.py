@@ -69,17 +69,17 @@ def check_array(name: str, shape: tuple[int, ...], chunks: tuple[int, ...] | Non
     if chunks is None:
         return
     if len(chunks) != len(shape) or not all(n >= 0 for n in shape) or not all(n > 0 for n in chunks):
-        raise ValueError(f"{name}: its chunks do not match its shape")
+        raise ValueError(f"{name}: expected chunks that match its shape")
     if math.prod(chunks) * dtype.itemsize > MAX_CHUNK:
-        raise ValueError(f"{name}: a chunk takes more than {MAX_CHUNK // 2**20} MiB")
+        raise ValueError(f"{name}: expected chunks of at most {MAX_CHUNK // 2**20} MiB, got larger ones")
     if math.prod(-(-length // chunk) for length, chunk in zip(shape, chunks, strict=True)) > MAX_CHUNKS:
-        raise ValueError(f"{name}: it has more than {MAX_CHUNKS} chunks")
+        raise ValueError(f"{name}: expected at most {MAX_CHUNKS} chunks, got more")
 
 
 def check_size(taken: float, size: int) -> None:
     """Raise ValueError if arrays of `taken` bytes are too large for a file of `size` bytes."""
     if taken > max(MAX_SIZE, MAX_RATIO * size):
-        raise ValueError(f"its arrays would take {taken / 2**20:.0f} MiB of memory, and it has {size} bytes")
+        raise ValueError(f"its arrays: expected less than {taken / 2**20:.0f} MiB in a file of {size} bytes")
 
 
 # --- HDF5 ---------------------------------------------------------------------------------------------------------
@@ -93,10 +93,10 @@ def open_h5(path: str) -> tuple[dict[str, Any], list[Array]]:
     _allow_no_more_files()
     names = list(file)
     if len(names) > MAX_ARRAYS:
-        raise ValueError(f"it holds more than {MAX_ARRAYS} objects")
+        raise ValueError(f"expected at most {MAX_ARRAYS} objects, got {len(names)}")
     for name in names:
         if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-            raise ValueError(f"{_quoted(name)} is a link")
+            raise ValueError(f"{_quoted(name)}: expected an array, got a link")
     return _h5_attributes("the file", file), [_h5_array(file, name) for name in names]
 
 
@@ -116,20 +116,20 @@ def _h5_array(file: Any, name: str) -> Array:
     found = h5o.open(file.id, name.encode("utf-8", "surrogateescape"))
     name = _quoted(name) if not name.isidentifier() else name
     if not isinstance(found, h5d.DatasetID):
-        raise ValueError(f"{name} is not an array")
+        raise ValueError(f"{name}: expected an array")
     plan = found.get_create_plist()
     if plan.get_external_count():
-        raise ValueError(f"{name}: its numbers are in another file (external storage)")
+        raise ValueError(f"{name}: expected numbers in this file, got external storage")
     if plan.get_layout() not in (h5d.COMPACT, h5d.CONTIGUOUS, h5d.CHUNKED):
-        raise ValueError(f"{name}: its numbers are in other datasets (virtual dataset)")
+        raise ValueError(f"{name}: expected numbers of its own, got a virtual dataset")
     allowed = (h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_SZIP, h5z.FILTER_LZF)
     for index in range(plan.get_nfilters()):
         if plan.get_filter(index)[0] not in allowed:
-            raise ValueError(f"{name}: filter {plan.get_filter(index)[0]} is not supported")
+            raise ValueError(f"{name}: expected a supported filter, got filter {plan.get_filter(index)[0]}")
     if found.get_type().get_class() not in (h5t.INTEGER, h5t.FLOAT):
-        raise ValueError(f"{name} is not an array of numbers")
+        raise ValueError(f"{name}: expected an array of numbers")
     if found.get_space().get_simple_extent_type() not in (h5s.SIMPLE, h5s.SCALAR):
-        raise ValueError(f"{name} is empty")
+        raise ValueError(f"{name}: expected an array, got an empty dataset")
     dataset = h5py.Dataset(found)
     attributes = _h5_attributes(name, dataset)
     shape, dtype = dataset.shape, dataset.dtype
@@ -154,9 +154,9 @@ def _h5_attributes(name: str, of: Any) -> dict[str, Any]:
     for attribute in of.attrs:
         one = of.attrs.get_id(attribute)
         if one.get_type().get_class() not in (h5t.INTEGER, h5t.FLOAT, h5t.STRING):
-            raise ValueError(f"{name}: an attribute is neither a number nor a text")
+            raise ValueError(f"{name}: expected attributes that are numbers or texts, got another type")
         if one.get_storage_size() > MAX_TEXT:
-            raise ValueError(f"{name}: an attribute takes more than {MAX_TEXT // 2**20} MiB")
+            raise ValueError(f"{name}: expected attributes of at most {MAX_TEXT // 2**20} MiB, got a larger one")
         value = of.attrs[attribute]
         value = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
         found[attribute] = value.decode() if isinstance(value, bytes) else value
@@ -178,11 +178,11 @@ def open_zarr(path: str) -> tuple[dict[str, Any], list[Array]]:
     root = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     names = [name for name in sorted(os.listdir(root)) if not name.startswith(".")]
     if len(names) > MAX_ARRAYS:
-        raise ValueError(f"it holds more than {MAX_ARRAYS} objects")
+        raise ValueError(f"expected at most {MAX_ARRAYS} objects, got {len(names)}")
     if "zarr.json" in names:
-        raise ValueError("it is a Zarr of format 3, expected format 2")
+        raise ValueError("expected a Zarr of format 2, got format 3")
     if _metadata(root, ".zgroup").get("zarr_format") != 2:
-        raise ValueError("it is not a Zarr group of format 2")
+        raise ValueError("expected a Zarr group of format 2")
     attributes = _metadata(root, ".zattrs")
     consolidated = _metadata(root, ".zmetadata", 16).get("metadata", {}) if _exists(root, ".zmetadata") else {}
     if not isinstance(consolidated, dict):
@@ -213,9 +213,9 @@ def _content(folder: int, name: str, max_size: int) -> bytes:
     with open(_open_in_folder(folder, name), "rb") as file:
         found = os.fstat(file.fileno())
         if not stat.S_ISREG(found.st_mode):
-            raise ValueError(f"{_quoted(name)} is not a regular file")
+            raise ValueError(f"{_quoted(name)}: expected a regular file")
         if found.st_size > max_size:
-            raise ValueError(f"{_quoted(name)}: it takes more than {max_size} bytes")
+            raise ValueError(f"{_quoted(name)}: expected at most {max_size} bytes, got {found.st_size}")
         return file.read(found.st_size)
 
 
@@ -233,15 +233,15 @@ def _checked(name: str, metadata: Any) -> tuple[tuple[int, ...], tuple[int, ...]
     """Return shape, chunks, type and codec of an array; ValueError if one is not supported."""
     metadata = metadata if isinstance(metadata, dict) else {}
     if metadata.get("zarr_format") != 2:
-        raise ValueError(f"{name} is not an array of format 2")
+        raise ValueError(f"{name}: expected an array of format 2")
     if metadata.get("filters"):
         raise ValueError(f"{name}: expected no filters")
     codec = _codec(name, metadata.get("compressor"))
     if metadata.get("dimension_separator", ".") != "." or metadata.get("order") not in ("C", "F"):
-        raise ValueError(f"{name}: order or dimension_separator is not supported")
+        raise ValueError(f"{name}: expected order C or F, and dimension_separator .")
     dtype = metadata.get("dtype")
     if not isinstance(dtype, str) or not re.fullmatch("[<>|][fiu][1248]", dtype):
-        raise ValueError(f"{name} is not an array of numbers")
+        raise ValueError(f"{name}: expected an array of numbers")
     shape, chunks = (_lengths(name, metadata.get(key)) for key in ("shape", "chunks"))
     check_array(name, shape, chunks, np.dtype(dtype))
     return shape, chunks, np.dtype(dtype), codec
@@ -266,7 +266,7 @@ def _zarr_array(root: int, name: str) -> Array:
     folder = _open_in_folder(root, name, os.O_DIRECTORY)
     name = _quoted(name) if not name.isidentifier() else name
     if _exists(folder, "zarr.json") or not _exists(folder, ".zarray"):
-        raise ValueError(f"{name} is not an array of format 2")
+        raise ValueError(f"{name}: expected an array of format 2")
     metadata = _metadata(folder, ".zarray")
     shape, chunks, dtype, codec = _checked(name, metadata)
     fill = metadata.get("fill_value")
@@ -282,7 +282,7 @@ def _zarr_array(root: int, name: str) -> Array:
             return np.full([part.stop for part in whole], empty)
         data = np.frombuffer(decode(_content(folder, key, 2 * MAX_CHUNK)), np.uint8)
         if data.size != math.prod(chunks) * dtype.itemsize:
-            raise ValueError(f"{name}: a chunk takes {data.size} bytes")
+            raise ValueError(f"{name}: expected chunks of {math.prod(chunks) * dtype.itemsize} bytes, got {data.size}")
         return data.view(dtype).reshape(chunks, order=metadata["order"])[whole]
 
     return Array(name, shape, dtype, chunks, {}, read)
@@ -370,7 +370,7 @@ def main() -> None:
         _more_time()
         send(request["path"], request["kind"], request["arrays"])
     except MemoryError:
-        sys.exit(f"reading it takes more than {MAX_MEMORY // 2**20} MiB of memory")
+        sys.exit(f"expected at most {MAX_MEMORY // 2**20} MiB of memory for reading it")
     except Exception as problem:  # on damaged files the libraries raise any exception
         sys.exit((str(problem).splitlines() or [type(problem).__name__])[0][:300])
 

@@ -53,7 +53,7 @@ class _Source:
         if first >> 16:  # up to four bytes in the place of the length
             found = _Element(first & 0xFFFF, at + 4, at + 4 + (first >> 16), at + 8)
             if first >> 16 > 4:
-                raise ValueError("a small element is longer than four bytes")
+                raise ValueError(f"expected a small element of at most 4 bytes, got {first >> 16}")
             self.file.seek(at + 4)
             return found
         end = at + 8 + count
@@ -70,7 +70,10 @@ class _Source:
         """Return the type and the data of the next element; ValueError if it is longer than `max_size` bytes."""
         found = self.element()
         if found.kind not in kinds or found.end - found.start > max_size:
-            raise ValueError(f"unexpected element of type {found.kind} with {found.end - found.start} bytes")
+            raise ValueError(
+                f"expected an element of type {kinds[0]} of at most {max_size} bytes, got type {found.kind} with "
+                f"{found.end - found.start} bytes"
+            )
         content = self.take(found.end - found.start)
         self.file.seek(found.after)
         return found.kind, content
@@ -92,7 +95,7 @@ def _variables(file: BinaryIO, size: int, arrays: bool) -> Iterator[tuple[str, A
     head = file.read(_HEAD)
     order = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}.get(head[124:])
     if order is None:
-        raise ValueError("it is not a .mat file of version 5 or 7.3")
+        raise ValueError("expected a .mat file of version 5 or 7.3")
     source, total = _Source(file, size, order), 0
     while file.tell() < size:
         outer = source.element()
@@ -103,9 +106,9 @@ def _variables(file: BinaryIO, size: int, arrays: bool) -> Iterator[tuple[str, A
             content = _inflated(source.take(outer.end - outer.start), order, total, size)
             inner = _Source(io.BytesIO(content), len(content), order)
             if inner.element().kind != _MATRIX:
-                raise ValueError("an element is not an array")
+                raise ValueError("expected elements that are arrays, got another type")
         elif outer.kind != _MATRIX:
-            raise ValueError("an element is not an array")
+            raise ValueError("expected elements that are arrays, got another type")
         else:
             inner = _Source(file, outer.end, order)
         name, value = _matrix(inner, arrays, total, size)
@@ -145,7 +148,7 @@ def _matrix(source: _Source, arrays: bool, total: int, size: int) -> tuple[str, 
     dtype = np.dtype(order + _TYPES[data.kind])
     count = math.prod(shape)
     if data.end > source.end or data.end - data.start != count * dtype.itemsize:
-        raise ValueError(f"{ascii(name)[:80]}: its length does not fit its shape")
+        raise ValueError(f"{ascii(name)[:80]}: expected {count} numbers by its shape, got another length")
     if not (arrays or name in ABOUT):
         return name, None
     check_arrays(total, size, count * dtype.itemsize)

@@ -8,6 +8,7 @@ from pathlib import Path
 from rosafe.offline.isolated import check_size
 from rosafe.tree import sizes
 
+LESS = "close other programs, or use a machine with more memory"  # advice
 _MEMINFO = Path("/proc/meminfo")
 
 
@@ -20,13 +21,12 @@ def available() -> int:
     return min(sizes.machine_memory(), int(found[1]) * 1024) if found else sizes.machine_memory()
 
 
-def refuse_over_available(size: float, subject: str, advice: str = "") -> None:
+def refuse_over_available(size: float, name: str, advice: str) -> None:
     """Raise ValueError, with `advice`, if `size` bytes are more than available: the system would end the process."""
-    text = f"{subject} would take {{taken:.1f}} GB of memory, this machine has {{limit:.1f}} GB left{advice}"
-    sizes.check_memory(available(), size, text, 1e9)
+    sizes.check_memory(name, available(), size, advice, "free on this machine")
 
 
 def check_arrays(before: int, file_size: int, size: float) -> None:
     """Raise ValueError if arrays of `size` bytes, after `before` bytes, are too large for the file or the memory."""
     check_size(before + size, file_size)
-    refuse_over_available(size, "its arrays")
+    refuse_over_available(size, "its arrays", LESS)

@@ -209,7 +209,7 @@ class ProcessCall:
                 size = max(size, self._size(pad, largest_block))
                 if pad:  # twice, as the frames before and after the change may be offset
                     self.padding = max(self.padding, 2 * self.chain.padding(frames))
-        refuse_over_available(size, "outputs: they", "; name fewer outputs, or take fewer channels or lags")
+        refuse_over_available(size, "outputs", "name fewer outputs, or take fewer channels or lags")
         for kind in self.outputs:
             centred, parts = KINDS[kind].centred, KINDS[kind].outputs
             self.collectors[kind] = {}

@@ -56,7 +56,7 @@ def _members(file: zipfile.ZipFile, size: int, arrays: bool) -> Iterator[tuple[s
     """Yield names and members of the arrays to be read, after a check of the total size."""
     members = file.infolist()
     if len(members) > _MAX_MEMBERS:
-        raise ValueError(f"it holds more than {_MAX_MEMBERS} arrays")
+        raise ValueError(f"expected at most {_MAX_MEMBERS} arrays, got {len(members)}")
     for one in members:
         if one.flag_bits & _ENCRYPTED or one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise ValueError("expected arrays that are stored or deflated, and not encrypted")
@@ -74,14 +74,14 @@ def _member(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         width = 2 if version[6:7] == b"\x01" else 4
         length = int.from_bytes(content.read(width), "little")
         if not _MAGIC.fullmatch(version) or length > _MAX_HEADER:
-            raise ValueError("a member is not an array")
+            raise ValueError(f"{member.filename[:80]!r}: expected an array")
         header = _HEADER.fullmatch(content.read(length).decode("latin-1"))
         if not header:
-            raise ValueError("a member is not an array of numbers, or a text")
+            raise ValueError(f"{member.filename[:80]!r}: expected an array of numbers, or a text")
         dtype, shape = np.dtype(header[1]), tuple(int(n) for n in re.findall(r"\d+", header[3]))
         size = math.prod(shape) * dtype.itemsize
         if member.file_size != len(version) + width + length + size or (shape and dtype.kind == "U"):
-            raise ValueError("the length of an array does not fit its shape")
+            raise ValueError(f"{member.filename[:80]!r}: expected {size} bytes by its shape, got another length")
         array = new_array(shape, dtype, "F" if header[2] == "True" else "C")
         _fill(content, array.reshape(-1, order="A").view(np.uint8).data if size else memoryview(b""))
         return array
@@ -94,7 +94,7 @@ def _fill(content: IO[bytes], buffer: memoryview) -> None:
             raise ValueError("it is cut off")
         buffer[at : at + _BLOCK] = part
     if content.read(1):  # reading to the end also verifies the checksum
-        raise ValueError("an array is longer than it says")
+        raise ValueError("expected the end of an array, got more bytes")
 
 
 def read_csv(path: Path, arrays: bool = True) -> dict[str, Any]:
@@ -103,16 +103,16 @@ def read_csv(path: Path, arrays: bool = True) -> dict[str, Any]:
         head = file.readline(_MAX_CSV_HEAD)
         begin = CSV_HEAD.encode()
         if not head.startswith(begin):
-            raise ValueError("its first line was not written by rosafe process")
+            raise ValueError("line 1: expected the first line that rosafe process writes")
         about = from_json(head.removeprefix(begin), _MAX_CSV_HEAD)
         if not isinstance(about, dict) or not isinstance(about.get("axes"), dict) or len(about["axes"]) != 1:
-            raise ValueError("its first line does not describe one output")
+            raise ValueError("line 1: expected the description of one output")
         fixed, rows = about.pop("fixed", None), about.pop("rows", None)
         about = checked(about)
         if not arrays:
             return about
         if not isinstance(fixed, dict) or type(rows) is not int:
-            raise ValueError("its first line does not describe its rows")
+            raise ValueError("line 1: expected the description of the rows")
         vectors = {name: _vector(name, value) for name, value in fixed.items()}
         time, *columns = file.readline(MAX_TEXT).decode().rstrip("\r\n").split(",")
         table = _table(file, rows, 1 + len(columns))
@@ -132,17 +132,17 @@ def _table(file: BinaryIO, rows: int, width: int) -> np.ndarray:
     """Read the rows of a .csv, each of `width` numbers."""
     size = os.fstat(file.fileno()).st_size
     if not 0 <= 2 * rows * width <= size:  # a digit and a comma for each number
-        raise ValueError(f"it is cut off: {rows} rows do not fit into {size} bytes")
+        raise ValueError(f"expected {rows} rows, got a file of {size} bytes: it is cut off")
     check_arrays(0, size, 16 * rows * width)
     table = new_array((rows, width), np.dtype(np.float64))
     for index, row in enumerate(table):
         numbers = file.readline(_MAX_NUMBER_LENGTH * width).split(b",")
         if len(numbers) != width:
-            raise ValueError(f"it is cut off, or damaged: expected {width} numbers in row {index + 1} of {rows}")
+            raise ValueError(f"row {index + 1} of {rows}: expected {width} numbers: it is cut off or damaged")
         try:
             row[:] = [float(number) for number in numbers]
         except ValueError:
             raise ValueError(f"row {index + 1}: expected numbers") from None
     if file.read(1):
-        raise ValueError(f"it has more than {rows} rows")
+        raise ValueError(f"expected {rows} rows, got more")
     return table

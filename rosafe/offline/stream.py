@@ -219,7 +219,7 @@ class Stream:
     def _check_size(self, stages: Mapping[str, Stage], frames: int) -> None:
         seconds = frames / self._rate
         size = sum(sizes.output_size(s, self._rows[KINDS[kind].parent], seconds) for kind, s in stages.items())
-        refuse_over_available(size, "block: its outputs")
+        refuse_over_available(size, "block", "process shorter blocks, or take fewer channels or lags")
 
     def reset(self) -> None:
         """Return to the state before the first block. Parameters are kept; the next block may have another format."""

@@ -35,27 +35,34 @@ def output_size(stage: Stage, rows: Rows, seconds: float) -> float:
     return sum(size(part, seconds * stage.output_format.rate) for part in stage.part_rows(rows))
 
 
-def check_memory(limit: float, taken: float, text: str, unit: float = 2**20) -> None:
-    """Raise ValueError if `taken` exceeds `limit` (bytes). `text` has the fields {taken} and {limit}, in units."""
+def check_memory(name: str, limit: float, taken: float, advice: str, whose: str = "", content: str = "") -> None:
+    """Raise ValueError with `advice` if the bytes `taken` by the `content` of `name` exceed `limit`.
+
+    `whose` names the memory of which `limit` is a part.
+    """
     if taken > limit:
-        raise ValueError(text.format(taken=taken / unit, limit=limit / unit))
+        expected, got = (f"{n / 2**20:.{0 if n >= 2**20 else 2}f} MiB" for n in (limit, taken))
+        whose, content = whose and f" ({whose})", content and f" for {content}"
+        raise ValueError(f"{name}: expected at most {expected}{whose}, got {got}{content}; {advice}")
 
 
 def check_stage(stage: Stage, rows: Rows, seconds: float) -> None:
     """Raise ValueError if `seconds` of a stage's output, a frame of its input, or its state is too large."""
     for part in stage.part_rows(rows):
-        _check_signal("port or history", part, seconds, stage.output_format.rate)
+        _check_signal("port or history", part, seconds, stage.output_format.rate, "shorter buffers")
     source = stage.input_format
     frames = (stage.output_format.window - source.window) / source.hop + 1
     name = f"{stage.prefix}_wSizeSec" if isinstance(stage, FramedStage) else "window"
-    _check_signal(name, rows, frames / source.rate, source.rate)
-    text = f"{stage.REPRESENTATION.kind}: the state for {_shape(rows)} values takes {{taken:.0f}} MiB"
-    check_memory(MAX_BYTES, state_size(stage, rows), f"{text}, more than {{limit:.0f}} MiB")
+    _check_signal(name, rows, frames / source.rate, source.rate, "a shorter window")
+    content = f"the state of {_shape(rows)} values"
+    name = stage.REPRESENTATION.kind
+    check_memory(name, MAX_BYTES, state_size(stage, rows), "take fewer channels", content=content)
 
 
-def _check_signal(name: str, rows: Rows, seconds: float, rate: float) -> None:
-    text = f"{name}: {seconds:g} s of {_shape(rows)} values at {rate:g} Hz take {{taken:.0f}} MiB"
-    check_memory(MAX_BYTES, size(rows, seconds * rate), f"{text}, more than {{limit:.0f}} MiB")
+def _check_signal(name: str, rows: Rows, seconds: float, rate: float, advice: str) -> None:
+    content = f"{seconds:g} s of {_shape(rows)} values at {rate:g} Hz"
+    taken = size(rows, seconds * rate)
+    check_memory(name, MAX_BYTES, taken, f"take {advice}, or fewer channels", content=content)
 
 
 def _shape(rows: Rows) -> str:
@@ -65,8 +72,11 @@ def _shape(rows: Rows) -> str:
 def check_all(stages: Iterable[tuple[Stage, Rows]], seconds: float) -> None:
     """Raise ValueError if `seconds` of output and the states of all stages exceed their share of the memory."""
     sizes = [output_size(stage, rows, seconds) + state_size(stage, rows) for stage, rows in stages]
-    text = (
-        f"{seconds:g} s of output of {len(sizes)} processors, and their states, take {{taken:.0f}} MiB, more than "
-        f"{{limit:.0f}} MiB, which is {MAX_MEMORY_FRACTION:.0%} of this machine's memory"
+    check_memory(
+        f"{len(sizes)} processors",
+        MAX_MEMORY_FRACTION * machine_memory(),
+        sum(sizes),
+        "remove processors, or take shorter buffers",
+        f"{MAX_MEMORY_FRACTION:.0%} of this machine's memory",
+        f"{seconds:g} s of output, and the states",
     )
-    check_memory(MAX_MEMORY_FRACTION * machine_memory(), sum(sizes), text)

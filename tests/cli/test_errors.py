@@ -210,7 +210,7 @@ def test_missing_disk_space_is_reported_before_processing(folder: Path) -> None:
         file.write(head[:4] + (36 + size).to_bytes(4, "little") + head[8:40] + size.to_bytes(4, "little"))
         file.truncate(len(head) + size)
     done = rosafe("process", "in.wav", "--set", "fb_nChannels=1000", cwd=folder)
-    refused(done, "in.wav", "B are free; name fewer", "--outputs")
+    refused(done, "in.wav", "B (free on the disk), got ", "TB; name fewer", "--outputs")
     assert_untouched(folder)
 
 
@@ -222,7 +222,7 @@ def test_blocks_that_exceed_the_memory(folder: Path, settings: list[str]) -> Non
     done = rosafe(
         "process", "in.wav", "--block", "10000000", "--outputs", "crossCorrelation", "--set", *settings, cwd=folder
     )
-    refused(done, "in.wav: ", "one block of output would take", "more than the limit of 1.1 GB", "--block")
+    refused(done, "in.wav: ", ": expected at most 1024 MiB", "MiB for one block", "--block")
     assert_untouched(folder)
 
 

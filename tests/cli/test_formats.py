@@ -144,7 +144,8 @@ def test_large_arrays_are_buffered_on_disk(
 
 def test_free_disk_space(tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files.os, "statvfs", lambda path: SimpleNamespace(f_bavail=3, f_frsize=4096))
-    with pytest.raises(OutputError, match=r"would take 432\.0 kB, but only 12\.3 kB are free; name fewer --outputs"):
+    text = r"^output: expected at most 12\.3 kB \(free on the disk\), got 432\.0 kB; name fewer --outputs"
+    with pytest.raises(OutputError, match=text):
         process_file(sound, tmp_path / "a.h5", SMALL_PARAMETERS, outputs=["ihc"])
     assert list(tmp_path.iterdir()) == [sound]
 

@@ -255,7 +255,7 @@ def test_many_blocks_take_no_memory() -> None:
     signal = np.lib.stride_tricks.as_strided(np.zeros(1, np.int16), (2, 10**9), (0, 0))
     tracemalloc.start()
     try:
-        refused("outputs: they would take", signal, RATE, block_frames=[1, 2], outputs=["input", "gammatone"])
+        refused("outputs: expected at most", signal, RATE, block_frames=[1, 2], outputs=["input", "gammatone"])
         assert tracemalloc.get_traced_memory()[1] < 10e6
     finally:
         tracemalloc.stop()
@@ -283,8 +283,9 @@ def test_positional_options_are_deprecated() -> None:
 
 
 def test_sizes_beyond_the_memory() -> None:
-    refused("ild_wSizeSec: 60 s of .* MiB, more than 1024 MiB", GOOD, 96000, parameters={"ild_wSizeSec": 60.0})
-    refused("more than 1024 MiB", GOOD, 96000, modifications=[(0, "ild_wSizeSec", 60.0)])
+    text = "ild_wSizeSec: expected at most 1024 MiB, got .* MiB for 60 s of 2x31 values at 96000 Hz; take a shorter"
+    refused(text, GOOD, 96000, parameters={"ild_wSizeSec": 60.0})
+    refused("ild_wSizeSec: expected at most 1024 MiB", GOOD, 96000, modifications=[(0, "ild_wSizeSec", 60.0)])
 
 
 def test_results_larger_than_the_free_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -293,8 +294,8 @@ def test_results_larger_than_the_free_memory(monkeypatch: pytest.MonkeyPatch, tm
     meminfo.write_text("MemTotal:       24684196 kB\nMemFree: 1 kB\nMemAvailable:      12000 kB\n")
     monkeypatch.setattr(memory, "_MEMINFO", meminfo)
     sound, large = np.zeros((2, 4000)), {"cc_maxDelaySec": 1.0}
-    refused(r"outputs: they would take .* GB of memory, this machine has 0\.0 GB left", sound, RATE, parameters=large)
-    with pytest.raises(ValueError, match=r"would take .* GB of memory, this machine has 0\.0 GB left"):
+    refused(r"outputs: expected at most 12 MiB \(free on this machine\), got", sound, RATE, parameters=large)
+    with pytest.raises(ValueError, match=r"^block: expected at most 12 MiB \(free on this machine\), got .*; process"):
         rosafe.Stream(RATE, large).process(sound)
     meminfo.unlink()  # the free memory is unknown
     assert memory.available() == sizes.machine_memory()
@@ -306,22 +307,22 @@ def test_large_files_are_refused_without_reading_them(tmp_path: Path) -> None:
     with open(path, "wb") as file:
         file.truncate(4 * 10**12)  # a sparse file, larger than any memory
     sound = np.memmap(path, np.int16, "r").reshape(-1, 2)
-    refused("outputs: they would take .* GB of memory", sound, RATE)
-    with pytest.raises(ValueError, match=r"block: its outputs would take .* GB of memory"):
+    refused("outputs: expected at most .* MiB", sound, RATE)
+    with pytest.raises(ValueError, match=r"^block: expected at most .* MiB"):
         rosafe.Stream(RATE).process(sound)
 
 
 def test_results_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sizes, "machine_memory", lambda: 2**24)
     sound, lags = np.zeros((2, 4000)), {"cc_maxDelaySec": 1.0}
-    refused("outputs: they would take .* GB of memory, this machine has", sound, RATE, parameters=lags)
-    refused("outputs: they would take", sound, RATE, modifications=[(0, *change) for change in lags.items()])
+    refused("outputs: expected at most 16 MiB .free on this machine.*; name fewer", sound, RATE, parameters=lags)
+    refused("outputs: expected at most", sound, RATE, modifications=[(0, *change) for change in lags.items()])
     at_the_end = [(3, "cc_maxDelaySec", 1e-3)]  # smaller again, but too large before
-    refused("outputs: they would take", sound, RATE, parameters=lags, block_frames=1000, modifications=at_the_end)
+    refused("outputs: expected at most", sound, RATE, parameters=lags, block_frames=1000, modifications=at_the_end)
     hidden = {
         "fb_nChannels": 500,
         "fb_highFreqHz": 4000.0,
     }  # the output of the filterbank is not stored, but computed as one block
-    refused("outputs: they would take", sound, RATE, parameters=hidden, outputs=["ild"])
+    refused("outputs: expected at most", sound, RATE, parameters=hidden, outputs=["ild"])
     with pytest.raises(AssertionError, match="it went as far as that"):
         rosafe.process(sound, RATE, parameters=hidden, block_frames=100, outputs=["ild"])

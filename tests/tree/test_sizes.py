@@ -76,7 +76,7 @@ def test_states_that_are_too_large(kind: str, parameters: dict[str, Any]) -> Non
     """They are rejected before they are allocated."""
     tracemalloc.start()
     try:
-        text = f"{kind}: the state for 2x1000 values takes [0-9]+ MiB, more than 1024 MiB"
+        text = f"{kind}: expected at most 1024 MiB, got [0-9]+ MiB for the state of 2x1000 values; take fewer channels"
         with pytest.raises(ValueError, match=text):
             rosafe.process(np.zeros((2, 1600)), RATE, parameters={**MANY, **parameters}, outputs=[kind])
         assert tracemalloc.get_traced_memory()[1] < 2**26
@@ -89,7 +89,8 @@ def test_the_autocorrelation_of_many_channels(tree: Tree, feed: Feed) -> None:
     tree.add_input("input", feed, 160, 1.0, 10.0)
     for kind, parent in (("preProc", "input"), ("gammatone", "preProc"), ("ihc", "gammatone")):
         tree.add(kind, kind, parent, {"fb_nChannels": 256, "fb_highFreqHz": 7000.0} if kind == "gammatone" else {})
-    with pytest.raises(ComponentError, match="10 s of 2x256x319 values at 100 Hz take 1246 MiB") as raised:
+    text = "expected at most 1024 MiB, got 1246 MiB for 10 s of 2x256x319 values at 100 Hz"
+    with pytest.raises(ComponentError, match=text) as raised:
         tree.add("autocorrelation", "autocorrelation", "ihc")
     assert raised.value.ex == "::rosAFE::e_badNewValue"
     assert [p.name for p in tree.processors] == ["input", "preProc", "gammatone", "ihc"]
@@ -101,5 +102,5 @@ def test_states_have_their_share_of_the_memory(monkeypatch: pytest.MonkeyPatch) 
     one = sizes.state_size(*stages[0]) + sizes.output_size(*stages[0], 1.0)
     monkeypatch.setattr(sizes, "machine_memory", lambda: int(one * 3.5 / sizes.MAX_MEMORY_FRACTION))
     sizes.check_all(stages[:3], 1.0)
-    with pytest.raises(ValueError, match=r"4 processors, and their states, take .* of this machine's memory"):
+    with pytest.raises(ValueError, match=r"4 processors: expected at most .* \(50% of this machine's memory\), got"):
         sizes.check_all(stages, 1.0)
