@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from operator import attrgetter
 
 import rosafe
 from rosafe.version import VERSION
@@ -13,8 +14,20 @@ from tests.harness import ROOT
 def listed() -> dict[str, tuple[str, str]]:
     """Return the arguments and the first version of each name in docs/api.md."""
     section = (ROOT / "docs" / "api.md").read_text("utf-8").split("\n## ")[1]
-    rows = re.findall(r"^\| `(\w+)` \| ?(.*?) ?\| ([0-9.]+) \|$", section, re.MULTILINE)
+    rows = re.findall(r"^\| `([\w.]+)` \| (?:`(.*)` )?\| ([0-9.]+) \|$", section, re.MULTILINE)
+    assert len(rows) == section.count("\n|") - 2
     return {name: (arguments, version) for name, arguments, version in rows}
+
+
+def arguments_of(name: str) -> str:
+    """Return the arguments of a function, class or method, with their defaults; "" for other values."""
+    value = attrgetter(name)(rosafe)
+    if not callable(value):
+        return ""
+    of_instance = "." in name and not inspect.ismethod(value)  # a method, not a class method
+    parameters = [*inspect.signature(value).parameters.values()][of_instance:]
+    bare = [parameter.replace(annotation=inspect.Parameter.empty) for parameter in parameters]
+    return str(inspect.Signature(bare))[1:-1]
 
 
 def release(version: str) -> tuple[int, ...]:
@@ -22,22 +35,30 @@ def release(version: str) -> tuple[int, ...]:
 
 
 def test_names_are_those_of_the_package() -> None:
-    assert set(listed()) == set(rosafe.__all__) == set(dir(rosafe)) - {"__doc__"}
-    for name in listed():
-        assert getattr(rosafe, name) is not None
+    functions = {name for name in listed() if "." not in name}
+    assert functions == set(rosafe.__all__) == set(dir(rosafe)) - {"__doc__"}
 
 
 def test_arguments() -> None:
-    """The first arguments keep their names and order; new ones come after them, are optional, and are listed, too."""
+    """Names, order, defaults, and whether they are accepted by position."""
     for name, (arguments, _) in listed().items():
-        value = getattr(rosafe, name)
-        found = ", ".join(inspect.signature(value).parameters) if callable(value) else ""
-        assert arguments == found, name
+        assert arguments == arguments_of(name), name
+
+
+def test_methods_are_those_of_the_library_page() -> None:
+    library = (ROOT / "docs" / "library.rst").read_text("utf-8")
+    for name in set(listed()) & set(rosafe.__all__):
+        found = re.search(rf"autoclass:: rosafe\.{name}\n   :members:(.*)", library)
+        public = {member for member in vars(getattr(rosafe, name)) if not member.startswith("_")} if found else set()
+        described = set(found[1].replace(",", " ").split()) or public if found else set()
+        assert {f"{name}.{member}" for member in described} == {n for n in listed() if n.startswith(f"{name}.")}
+        assert described <= public
 
 
 def test_versions() -> None:
     """The names of 0.2 still exist: their removal requires a release with a warning."""
     first = {name: release(version) for name, (_, version) in listed().items()}
-    assert max(first.values()) <= max(release(VERSION), (0, 3))
+    assert max(first.values()) <= release(VERSION)
     of_0_2 = {"process", "Stream", "load", "plot", "to_xarray", "__version__"}
+    of_0_2 |= {f"Stream.{method}" for method in ("process", "reset", "modify", "describe")}
     assert {name for name, version in first.items() if version <= (0, 2)} == of_0_2
