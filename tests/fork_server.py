@@ -281,13 +281,13 @@ def _become(request: Mapping[str, Any], streams: Sequence[int], base_path: Seque
 
 def _run(script: str) -> None:
     """Run a script and end the process without deleting the imported modules, which takes longer than most programs."""
-    status = None
+    status = 0
     try:
         runpy.run_path(script, run_name="__main__")
     except SystemExit as end:
-        status = end.code
-        if not (status is None or isinstance(status, int)):
+        if isinstance(end.code, str):
             raise
+        status = end.code or 0
     threading._shutdown()  # type: ignore[attr-defined]  # what Python does at the end, too: wait for threads, ...
     atexit._run_exitfuncs()  # ... call the registered functions, ...
     try:
@@ -295,7 +295,7 @@ def _run(script: str) -> None:
         sys.stderr.flush()
     except OSError:
         sys.exit(status)  # Python reports it
-    os._exit((status or 0) & 0xFF)
+    os._exit(status & 0xFF)
 
 
 if __name__ == "__main__":
