@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from rosafe.declarations.reference import Reference
 
-_JASA = "J. Acoust. Soc. Am."
-_ICASSP = "Proc. IEEE Int. Conf. Acoustics, Speech, and Signal Processing"
+_JASA = "Journal of the Acoustical Society of America"
+_ICASSP = "Proceedings of the IEEE International Conference on Acoustics, Speech, and Signal Processing"
 
 BACKUS_2006 = Reference(
     "backus2006",
@@ -67,7 +67,7 @@ BROWN_1994 = Reference(
     "Brown, G. J. and Cooke, M.",
     1994,
     "Computational auditory scene analysis",
-    "Comput. Speech Lang.",
+    "Computer Speech and Language",
     "8",
     "297-336",
     doi="10.1006/csla.1994.1016",
@@ -156,7 +156,7 @@ GLASBERG_1990 = Reference(
     "Glasberg, B. R. and Moore, B. C. J.",
     1990,
     "Derivation of auditory filter shapes from notched-noise data",
-    "Hear. Res.",
+    "Hearing Research",
     "47",
     "103-138",
     doi="10.1016/0378-5955(90)90170-T",
@@ -167,7 +167,7 @@ GOODE_1994 = Reference(
     "Goode, R. L. and Killion, M. and Nakamura, K. and Nishihara, S.",
     1994,
     "New knowledge about the function of the human middle ear: development of an improved analog model",
-    "Am. J. Otol.",
+    "American Journal of Otology",
     "15",
     "145-154",
 )
@@ -177,7 +177,7 @@ HOHMANN_2002 = Reference(
     "Hohmann, V.",
     2002,
     "Frequency analysis and synthesis using a Gammatone filterbank",
-    "Acta Acust. united Acust.",
+    "Acta Acustica united with Acustica",
     "88",
     "433-442",
 )
@@ -274,7 +274,7 @@ LIBERMAN_1988 = Reference(
     "Liberman, M. C.",
     1988,
     "Response properties of cochlear efferent neurons: monaural vs. binaural stimulation and the effects of noise",
-    "J. Neurophysiol.",
+    "Journal of Neurophysiology",
     "60",
     "1779-1798",
 )
@@ -306,7 +306,7 @@ MAJDAK_2022 = Reference(
     "Majdak, P. and Hollomey, C. and Baumgartner, R.",
     2022,
     "AMT 1.x: A toolbox for reproducible research in auditory modeling",
-    "Acta Acust.",
+    "Acta Acustica",
     "6",
     "19",
     doi="10.1051/aacus/2022011",
@@ -317,7 +317,7 @@ MAY_2011 = Reference(
     "May, T. and van de Par, S. and Kohlrausch, A.",
     2011,
     "A probabilistic model for robust localization based on a binaural auditory front-end",
-    "IEEE Trans. Audio Speech Lang. Process.",
+    "IEEE Transactions on Audio, Speech, and Language Processing",
     "19",
     "1-13",
     doi="10.1109/TASL.2010.2042128",
@@ -401,7 +401,7 @@ QIU_2003 = Reference(
     "Qiu, A. and Schreiner, C. E. and Escabí, M. A.",
     2003,
     "Gabor analysis of auditory midbrain receptive fields: spectro-temporal and binaural composition",
-    "J. Neurophysiol.",
+    "Journal of Neurophysiology",
     "90",
     "456-476",
     doi="10.1152/jn.00851.2002",
@@ -412,7 +412,7 @@ RABINER_1977 = Reference(
     "Rabiner, L. R.",
     1977,
     "On the use of autocorrelation analysis for pitch detection",
-    "IEEE Trans. Acoust. Speech Signal Process.",
+    "IEEE Transactions on Acoustics, Speech, and Signal Processing",
     "25",
     "24-33",
     doi="10.1109/TASSP.1977.1162905",
@@ -475,7 +475,7 @@ TCHORZ_2003 = Reference(
     "Tchorz, J. and Kollmeier, B.",
     2003,
     "SNR estimation based on amplitude modulation analysis with applications to noise suppression",
-    "IEEE Trans. Speech Audio Process.",
+    "IEEE Transactions on Speech and Audio Processing",
     "11",
     "184-192",
     doi="10.1109/TSA.2003.811542",
@@ -486,7 +486,7 @@ TERHARDT_1979 = Reference(
     "Terhardt, E.",
     1979,
     "Calculating virtual pitch",
-    "Hear. Res.",
+    "Hearing Research",
     "1",
     "155-182",
     doi="10.1016/0378-5955(79)90025-X",
@@ -497,7 +497,7 @@ TOLONEN_2000 = Reference(
     "Tolonen, T. and Karjalainen, M.",
     2000,
     "A computationally efficient multipitch analysis model",
-    "IEEE Trans. Speech Audio Process.",
+    "IEEE Transactions on Speech and Audio Processing",
     "8",
     "708-716",
     doi="10.1109/89.876309",
@@ -528,7 +528,7 @@ TZANETAKIS_2002 = Reference(
     "Tzanetakis, G. and Cook, P.",
     2002,
     "Musical genre classification of audio signals",
-    "IEEE Trans. Speech Audio Process.",
+    "IEEE Transactions on Speech and Audio Processing",
     "10",
     "293-302",
     doi="10.1109/TSA.2002.800560",
@@ -539,7 +539,7 @@ WALLACH_1949 = Reference(
     "Wallach, H. and Newman, E. B. and Rosenzweig, M. R.",
     1949,
     "The precedence effect in sound localization",
-    "Am. J. Psychol.",
+    "American Journal of Psychology",
     "62",
     "315-336",
     doi="10.2307/1418275",
