@@ -32,6 +32,8 @@ RING_SECONDS = 10.0  # the tree may fall behind by this much before frames are l
 OVERLAP_CHECK_FRAMES = 1000  # frames of a window that are compared with the previous window
 CURRENT_CHUNKS = 2  # a message is of a running acquisition if its newest frame is at most this old
 NEXT_MESSAGE_SECONDS = 0.25  # that a new reader waits for another message if the last one is older
+COMBINED_SECONDS = 0.1  # of sound; the most that a reader of unobserved blocks reads at once
+PAUSE_SECONDS = 0.05  # after a message; then such a reader does not wait for more sound
 
 
 @dataclass
@@ -68,6 +70,7 @@ class AudioRing:
         self._arrived = threading.Condition()  # also guards all attributes
         self._window = 0  # frames in the last message
         self._current_until = 0.0  # s since 1970, of the last message; infinite if it has no stamp
+        self._arrived_at = 0.0  # s, monotonic, of the last message
         self._discontinuity = 1  # number of the first frame after the last one
         self._readers: list[AudioReader] = []
         self._connection: object = None
@@ -112,12 +115,11 @@ class AudioRing:
             chunk_seconds = message.nFramesPerChunk / message.sampleRate
             self._current_until = stamp + CURRENT_CHUNKS * chunk_seconds if stamp else math.inf
             self._arrived.notify_all()
-            now = time.monotonic()
+            self._arrived_at = now = time.monotonic()
             callbacks = []
             for reader in self._readers:
-                unread = self._unread(reader)
-                reader.lag.update(unread, now)
-                if unread >= reader.frames_per_block:
+                reader.lag.update(self._unread(reader), now)
+                if self._is_complete(reader, now):
                     callbacks.append(reader.wake)
         for wake in callbacks:
             wake()
@@ -237,7 +239,7 @@ class AudioRing:
         return self._frames.newest + 1 - max(reader.position, self._frames.oldest)
 
     def read(self, reader: AudioReader) -> tuple[np.ndarray, int] | None:
-        """Return the next block of `reader` and the number of the frame after it, or None if it is incomplete."""
+        """Return the next block of `reader`, or several unobserved ones, and the number of the frame after it."""
         count, frames = reader.frames_per_block, self._frames
         with self._arrived:
             if reader.ended or self.sample_rate != reader.sample_rate:
@@ -245,17 +247,35 @@ class AudioRing:
             if reader.position < frames.oldest:
                 self._record_gap(reader.position, frames.oldest - reader.position)
                 reader.position = frames.oldest
-            if frames.newest + 1 - reader.position < count:
+            blocks = min((frames.newest + 1 - reader.position) // count, reader.combined_blocks())
+            if blocks < 1:
                 return None
-            reader.position += count
-            reader.lag.block_read()
-            reader.lag.update(frames.newest + 1 - reader.position, time.monotonic())
-            return frames.copy(reader.position - count, count), reader.position
+            first, reader.position = reader.position, reader.position + blocks * count
+            reader.lag.blocks_read(blocks)
+            reader.lag.update(self._unread(reader), time.monotonic())
+            return frames.copy(first, blocks * count), reader.position
+
+    def _is_complete(self, reader: AudioReader, now: float) -> bool:
+        """Return whether there are as many unread blocks as `reader` reads at once."""
+        unread = self._unread(reader) // reader.frames_per_block
+        if unread < 1 or unread >= reader.combined_blocks():
+            return unread >= 1
+        return reader.position <= reader.awaited or now - self._arrived_at > PAUSE_SECONDS
 
     def waiting(self, reader: AudioReader) -> bool:
-        """Return whether the next block of `reader` is incomplete."""
+        """Return whether `reader` has nothing to read yet."""
         with self._arrived:
-            return self._unread(reader) < reader.frames_per_block
+            return not self._is_complete(reader, time.monotonic())
+
+    def catch_up(self) -> bool:
+        """Let all readers read the blocks that have arrived. Return whether there were any."""
+        with self._arrived:
+            late = [reader for reader in self._readers if self._unread(reader) >= reader.frames_per_block]
+            for reader in late:
+                reader.awaited = self._frames.newest
+        for reader in late:
+            reader.wake()
+        return bool(late)
 
     def stop(self, reader: AudioReader) -> None:
         """Remove a reader."""
@@ -296,9 +316,17 @@ class AudioReader:
         self.sample_rate = float(sample_rate)
         self.position = position  # number of the next frame to read; set by the ring
         self.lag = lag
+        self.awaited = 0  # number of the last frame that a request waits for
         self.ended = False
+        self.is_observed: Callable[[], bool] = lambda: True  # whether the result of each block is received
         self.wake: Callable[[], None] = lambda: None
         self._ring = ring
+
+    def combined_blocks(self) -> int:
+        """Return the number of blocks to read at once."""
+        if self.is_observed():
+            return 1
+        return max(1, int(COMBINED_SECONDS * self.sample_rate / self.frames_per_block))
 
     def open(self, wake: Callable[[], None]) -> None:
         """Call `wake` whenever audio has arrived."""
@@ -310,7 +338,7 @@ class AudioReader:
 
     @property
     def waiting(self) -> bool:
-        """Whether the next block is incomplete; `wake` is called when it is complete."""
+        """Whether there is nothing to read yet; `wake` is called when there is."""
         return not self.ended and self._ring.waiting(self)
 
     def stop(self) -> None:

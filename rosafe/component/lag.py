@@ -35,9 +35,9 @@ class LagMonitor:
         self._behind_since: float | None = None
         self._blocks = 0  # read since then
 
-    def block_read(self) -> None:
-        """Count a block that was read."""
-        self._blocks += 1
+    def blocks_read(self, count: int) -> None:
+        """Count blocks that were read."""
+        self._blocks += count
 
     def update(self, waiting: int, now: float) -> None:
         """Update the number of waiting frames at the time `now` (s, monotonic)."""

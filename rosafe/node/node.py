@@ -48,6 +48,7 @@ OPTIONS = {
         "soon as there is sound (default: the ROS parameter ~keep; without it, nothing is saved)",
     },
 }
+CATCH_UP_SECONDS = 0.1  # that getSignals waits for the blocks that have arrived
 
 
 class RosafeNode:
@@ -64,7 +65,8 @@ class RosafeNode:
         self.finished = self._node.finished
         self._audio = AudioInput(self._warn)
         self._choices = ChoiceFallbacks(strict)
-        self._published = PublishedTree(self._node, _workers(), self._choices, self._audio.ring.captured)
+        ring = self._audio.ring
+        self._published = PublishedTree(self._node, _workers(), self._choices, ring.captured, ring.catch_up)
         self._tree = self._published.tree
         self._starting = threading.Lock()  # so that an interrupted InputProc does not replace the tree of a newer one
         self._input_values: dict[str, Any] = {}  # parameters of the running InputProc
@@ -132,6 +134,7 @@ class RosafeNode:
         if reader is None:
             activity.raise_if_interrupted()
             raise ROSAFE.error("e_noData", f"no audio from {self._audio.topic}: is bass acquiring?")
+        reader.is_observed = self._published.is_observed
         try:
             with self._starting:
                 activity.raise_if_interrupted()
@@ -182,6 +185,8 @@ class RosafeNode:
         return ExistingProcessor(processor.name, processor.kind, parent.name if parent is not None else "", values)
 
     def _get_signals(self, values: dict[str, Any]) -> dict[str, Any]:
+        if self._audio.ring.catch_up():
+            self._tree.wait_idle(CATCH_UP_SECONDS)
         return responses.response("getSignals", signals=responses.signals(self._tree.processors))
 
     def _get_processors(self, values: dict[str, Any]) -> dict[str, Any]:

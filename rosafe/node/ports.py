@@ -49,6 +49,11 @@ class OutputPort:
         self._message = serialization.message_class("rosAFE", LAYOUTS[processor.kind].idl)
         self._newest = NewestMessage(self._build)
 
+    @property
+    def has_subscribers(self) -> bool:
+        """Whether the topic has subscribers."""
+        return self._publisher.has_subscribers
+
     def publish(self) -> None:
         """Publish the window of the processor's history; without subscribers, it is built for the first one."""
         self._publisher.publish_newest(self._newest)

@@ -33,6 +33,8 @@ class PublishedTree:
     choices : ChoiceFallbacks
     captured : callable
         Returns the time at which an audio frame was captured; None if it is unknown.
+    catch_up : callable
+        Called when a port gets a subscriber: blocks that have arrived should be processed.
 
     Attributes
     ----------
@@ -46,10 +48,12 @@ class PublishedTree:
         workers: int,
         choices: ChoiceFallbacks,
         captured: Callable[[int], LinearClock | None],
+        catch_up: Callable[[], object],
     ) -> None:
         self._node = node
         self._choices = choices
         self._captured = captured
+        self._catch_up = catch_up
         self._ports: dict[Processor, OutputPort] = {}
         self._activities: dict[Processor, Activity] = {}
         self._input_port = self._advertise("input")
@@ -77,6 +81,12 @@ class PublishedTree:
         self._node.settle()
         if processor.error is not None:
             raise ComponentError("::genom::unkex", what=str(Failure.of(processor)))
+
+    def is_observed(self) -> bool:
+        """Return whether each block has an observer, or a port has a subscriber."""
+        if self._frame_time.has_subscribers:
+            return True
+        return any(processor.observers or port.has_subscribers for processor, port in tuple(self._ports.items()))
 
     # --- events of the tree, on its threads ---
 
@@ -124,4 +134,6 @@ class PublishedTree:
 
     def _advertise(self, kind: str, name: str = "") -> Publisher:
         message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
-        return self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
+        publisher = self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
+        publisher.impl.on_connection = self._catch_up
+        return publisher

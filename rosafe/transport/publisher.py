@@ -50,6 +50,12 @@ class Publisher(rospy.Publisher):
                 manager._add(_Topic(topic, data_class), manager.pubs, Registration.PUB)
             super().__init__(name, data_class, latch=True, queue_size=1)
 
+    @property
+    def has_subscribers(self) -> bool:
+        """Whether there is a subscriber."""
+        topic = self.impl
+        return topic is not None and bool(topic.connections)
+
     def publish_newest(self, newest: NewestMessage) -> None:
         """Publish the message `newest.build()`. Without subscribers it is built when the first one connects."""
         topic = self.impl

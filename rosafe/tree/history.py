@@ -53,11 +53,13 @@ class History:
         self._lock = threading.Lock()  # guards all attributes
         self._signal = signal
         self._frames = (0.0, 0)  # seconds and frames of the windows
+        self._port_window: tuple[float, tuple[WindowView, ...]] = (-1.0, ())  # seconds, and views of them
         self._clear(output_shapes)
 
     def _clear(self, output_shapes: Sequence[tuple[int, ...]]) -> None:
         self._shapes = list(output_shapes)
         self._windows = [SlidingWindow(shape, self._frames[1]) for shape in output_shapes]
+        self._port_window = (-1.0, ())
         self._appended = 0  # frames in total
         self._read: dict[str, int] = {}  # how many of them each reader has read
 
@@ -81,9 +83,12 @@ class History:
             shapes = [part.shape[:-1] for part in block.parts]
             if block.signal is not self._signal or shapes != self._shapes or seconds != self._frames[0]:
                 self._resize(block.signal, shapes, seconds)
-            for window, part in zip(self._windows, block.parts, strict=True):
-                window.append(part)
-            self._appended += block.parts[0].shape[-1]
+            frames = block.parts[0].shape[-1]
+            if frames:  # many short blocks complete no frame
+                for window, part in zip(self._windows, block.parts, strict=True):
+                    window.append(part)
+                self._appended += frames
+                self._port_window = (-1.0, ())
 
     @property
     def next_index(self) -> int:
@@ -97,7 +102,7 @@ class History:
         self._frames = (seconds, frames_in(seconds, signal.rate))
         if signal.rate != self._signal.rate or shapes != self._shapes:
             self._clear(shapes)
-        self._signal = signal
+        self._signal, self._port_window = signal, (-1.0, ())
         for window in self._windows:
             window.frames = self._frames[1]
 
@@ -110,9 +115,14 @@ class History:
             return HistorySlice(tuple(window.view(new) for window in self._windows), self._next_index, self._signal)
 
     def port_window(self) -> HistorySlice:
-        """Return the newest `port_seconds` of output, with zeros before the first block."""
+        """Return the newest `port_seconds` of output, with zeros before the first block.
+
+        The views are the same objects as in the last call if no frame was appended since then.
+        """
         with self._lock:
             self._add_pending()
-            frames = frames_in(self.port_seconds, self._signal.rate)
-            views = tuple(window.padded_view(frames) for window in self._windows)
-            return HistorySlice(views, self._next_index, self._signal)
+            if self._port_window[0] != self.port_seconds:
+                frames = frames_in(self.port_seconds, self._signal.rate)
+                views = tuple(window.padded_view(frames) for window in self._windows)
+                self._port_window = (self.port_seconds, views)
+            return HistorySlice(self._port_window[1], self._next_index, self._signal)

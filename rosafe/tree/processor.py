@@ -10,13 +10,14 @@ from typing import Any, TypeVar
 
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.numeric_limits import FloatArray
-from rosafe.dsp.plugin_checks import PluginError
+from rosafe.dsp.plugin_checks import CheckedStage, PluginError
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block, Source
 from rosafe.tree.context import TreeContext
 from rosafe.tree.history import History
 from rosafe.tree.parameter_updates import ParameterUpdates
+from rosafe.tree.source_reader import SourceReader
 from rosafe.tree.states import State, StateMachine
 
 T = TypeVar("T")
@@ -80,7 +81,7 @@ class Processor(StateMachine):
         self.estimated_seconds = math.inf
         self.output_buffer_for: Callable[[Block], FloatArray | None] | None = None
         self._context = context
-        self._source = source
+        self._source_reader = None if source is None else SourceReader(self, source, context.workers)
         self._started = False
         self._publish_seconds = 0.0  # duration of the last call of the listener
         self._publish_lock = threading.Lock()  # `on_released` and `on_removed` exclude each other
@@ -140,25 +141,27 @@ class Processor(StateMachine):
         stage = self.stage
         return {**stage.parameters, **stage.derived}
 
+    @property
+    def trusted(self) -> bool:
+        """Whether its stage is not a plugin, which may not return."""
+        return not isinstance(self.changes.final_stage, CheckedStage)
+
     # --- life ---
 
     def start(self) -> None:
         """Start to work, with the block that the parent released last."""
         workers = self._context.workers
         with workers.lock:
-            workers.add_client()  # raises before anything is attached if no thread can be started
+            workers.add_client(self)  # raises before anything is attached if no thread can be started
             self._started = True
             self.attach()
             workers.wake()
-        if self._source is not None:
-            self._source.open(self._wake)
-            self._wake()
+        if self._source_reader is not None:
+            self._source_reader.start()
 
-    def _wake(self) -> None:
-        """Check whether the source has a block."""
-        with self._context.workers.lock:
-            self.notify_input()
-            self._context.workers.wake()
+    def check_source(self) -> None:
+        if self._source_reader is not None:
+            self._source_reader.check()
 
     def end(self) -> None:
         """Remove the processor immediately. The result of a computation still in progress is discarded."""
@@ -166,10 +169,10 @@ class Processor(StateMachine):
         with workers.lock:
             self.remove()
             if self._started:
-                workers.remove_client()
+                workers.remove_client(self)
             workers.wake()
-        if self._source is not None:
-            self._source.stop()
+        if self._source_reader is not None:
+            self._source_reader.stop()
         with self._publish_lock:
             self._context.listener.on_removed(self)
 
@@ -201,8 +204,8 @@ class Processor(StateMachine):
             if self.unpublished_block is not None:
                 self._publish(self.unpublished_block, monotonic())
                 return
-            if self._source is not None:
-                self._read(self._source)
+            if self._source_reader is not None:
+                self._source_reader.read()
             if self.current_block is not None:
                 self._compute(self.current_block)
         except BaseException as problem:  # any failure must reach the tree, and no other processor may keep waiting
@@ -212,22 +215,6 @@ class Processor(StateMachine):
             self.blocked_since = monotonic()  # requests may block the callback
             self._context.on_failure(self)
             self.blocked_since = 0.0
-
-    def _read(self, source: Source) -> None:
-        """Read the next block of the source if there is one, or end with the source."""
-        self.blocked_since = monotonic()
-        while True:
-            ended = source.ended  # read first: blocks that arrived before the end are still processed
-            got = source.read()
-            if got is not None or ended == source.ended:
-                break
-        more = not source.waiting
-        self.blocked_since = 0.0
-        with self._context.workers.lock:
-            if got is not None:
-                self.accept_input_block(Block(self.blocks, (got[0],), got[1], self.stage.input_format), more)
-            elif ended:
-                self.end_of_stream()
 
     def _compute(self, block: Block) -> None:
         begun = monotonic()

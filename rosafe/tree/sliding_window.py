@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -43,9 +44,16 @@ class WindowView:
         """(..., frames)"""
         return (*self.pieces[0].shape[:-1], self.frames)
 
+    @functools.cached_property
+    def derived(self) -> dict[int | str, Any]:
+        """Results that were computed from the content, by name, so that they are computed once: see `select`."""
+        return {}
+
     def select(self, row: int) -> WindowView:
         """Return the part at index `row` of the first axis, such as one ear."""
-        return WindowView(tuple(piece[row] for piece in self.pieces), self.skip)
+        if row not in self.derived:
+            self.derived[row] = WindowView(tuple(piece[row] for piece in self.pieces), self.skip)
+        return self.derived[row]
 
     def swap_rows(self) -> WindowView:
         """Return the view with its first two axes exchanged, such as [channel][lag] to the port's [lag][channel]."""

@@ -42,6 +42,7 @@ class Tree:
         self._requests = threading.RLock()  # one request at a time; acquired before _lock
         self._workers = Workers(self._lock, workers_to_use(workers), real_time)
         self._context = TreeContext(self._workers, listener, self.end, threading.Condition(self._lock))
+        self.wait_idle = self._workers.wait_idle
         self.sample_rate = 0.0
         self.port_seconds = self.history_seconds = 1.0
 

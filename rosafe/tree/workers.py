@@ -6,6 +6,9 @@ another worker only if a task remains, a worker is idle, and the tasks are long 
 no switching between threads; with several, siblings and successive blocks are processed concurrently. The idle
 worker that worked last is woken, as its cache is the warmest.
 
+The thread that receives sound in real time runs short tasks itself if all workers are idle (`run_short_tasks`), because
+waking another thread delays them, and takes processor time.
+
 Only computing workers count towards the limit. A worker that is blocked by other code (a listener that does not return,
 a source that does not respond), or whose processor was removed, loses its slot to another worker after
 `BLOCKED_TIMEOUT_SECONDS`.
@@ -30,6 +33,10 @@ REAL_TIME_THRESHOLD_SECONDS = 0.02  # the same for sound in real time: two cores
 # that keeps up delivers results later than with two workers by less than this
 BUSY_THRESHOLD_SECONDS = 2.5e-4  # the same for a busy pool, whose tree may not keep up: its workers were not all idle
 BUSY_SECONDS = 0.1  # within this time
+POLL_SECONDS = 1e-3  # of `wait_idle`
+SHORT_TASK_SECONDS = 1e-3  # estimated; the thread that receives sound leaves longer tasks to the workers,
+SHORT_RUN_SECONDS = 5e-3  # and the remaining ones after this time;
+REFUSED_RUNS = 32  # it then leaves the tasks of this many messages to the workers
 WORKER = "rosafe worker"  # prefix of the threads' names
 
 
@@ -55,6 +62,10 @@ class Task(Protocol):
     blocked_since: float  # time.monotonic() since which other code blocks it; 0 if none does
 
     @property
+    def trusted(self) -> bool:
+        """Return whether it contains only code of this package, which returns."""
+
+    @property
     def removed(self) -> bool:
         """Return whether the result of the current work is no longer needed."""
 
@@ -67,6 +78,9 @@ class Task(Protocol):
     def end_work(self) -> None:
         """End the work on it; it may be ready again."""
 
+    def check_source(self) -> None:
+        """Read if its source, if it has one, has a block; in real time called regularly, without the lock."""
+
 
 class _Worker:
     """The task of one thread, and whether it occupies a slot."""
@@ -74,6 +88,7 @@ class _Worker:
     def __init__(self, lock: threading.RLock) -> None:
         self.task: Task | None = None
         self.has_slot = False  # counts towards the limit
+        self.refusals = 0  # calls of `run_short_tasks` in which it will run none
         self.woken = threading.Condition(lock)
 
 
@@ -94,8 +109,8 @@ class Workers:
     def __init__(self, lock: threading.RLock, count: int, real_time: bool = False) -> None:
         self.lock = lock
         self.count = count
-        self._real_time = real_time
-        self._clients = 0
+        self.real_time = real_time
+        self._clients: list[Task] = []
         self._ready: list[tuple[int, int, Task]] = []  # a heap: the deepest first, of these the newest
         self._sequence = itertools.count(0, -1)
         self._free_slots = count  # slots that no worker occupies
@@ -104,25 +119,26 @@ class Workers:
         self._busy_since = time.monotonic()  # when all workers were idle last
         self._last: dict[int, _Worker] = {}  # the worker that ran a task last, by its id
         self._watch = threading.Condition(lock)
+        self._caller = _Worker(lock)  # the thread in `run_short_tasks`
         self._workers: list[_Worker] = []
         self._threads: dict[str, threading.Thread] = {}
 
-    def add_client(self) -> None:
+    def add_client(self, client: Task) -> None:
         """Add a client. Raises RuntimeError if the system cannot start the first thread."""
-        self._clients += 1
+        self._clients.append(client)
         try:
             if not self._threads:
                 self._start("rosafe watch", self._monitor_blocked)
             if not self._workers:
                 self._start_worker()
         except RuntimeError:
-            self.remove_client()
+            self.remove_client(client)
             raise
 
-    def remove_client(self) -> None:
+    def remove_client(self, client: Task) -> None:
         """Remove a client; the threads end with the last one."""
-        self._clients -= 1
-        if self._clients == 0:
+        self._clients.remove(client)
+        if not self._clients:
             self._ready, self._last = [], {}
             while self._idle:
                 self._notify_idle()
@@ -136,6 +152,17 @@ class Workers:
             thread.join()
 
     # --- tasks ---
+
+    def wait_idle(self, timeout: float) -> bool:
+        """Wait until no task is ready and no worker computes. Return False after `timeout` seconds."""
+        end = time.monotonic() + timeout
+        while True:
+            with self.lock:
+                if not self._ready and not self._woken and self._free_slots == self.count:
+                    return True
+            if time.monotonic() > end:
+                return False
+            time.sleep(POLL_SECONDS)
 
     def push(self, task: Task) -> None:
         """Add a ready task. A caller that is not a worker calls `wake` afterwards."""
@@ -152,13 +179,51 @@ class Workers:
             except RuntimeError:  # no thread can be started: the existing ones continue
                 return
 
+    def run_short_tasks(self) -> None:
+        """Run ready tasks on the calling thread, without the lock, while they are short, and wake workers for the rest.
+
+        Without `real_time`, or if a worker computes, the tasks are left to the workers.
+        """
+        me = self._caller
+        me.refusals = max(0, me.refusals - 1)
+        if self.real_time and not me.refusals and self._free_slots == self.count and not self._woken:
+            me.has_slot, self._free_slots = True, self._free_slots - 1
+            end = time.monotonic() + SHORT_RUN_SECONDS
+            while me.has_slot and (task := self._pop_short_task()) is not None:
+                if task.begin_work():
+                    me.task = task
+                    self._work(task)
+                    if time.monotonic() > end:
+                        break
+            self._release_slot(me)
+            if self._ready:  # handing tasks over costs more than leaving all to the workers
+                me.refusals = REFUSED_RUNS
+        self.wake()
+
+    def _pop_short_task(self) -> Task | None:
+        """Return the deepest ready task if it is trusted and short."""
+        task = self._ready[0][2] if self._ready else None
+        if task is None or not task.trusted or task.estimated_seconds > SHORT_TASK_SECONDS:
+            return None
+        heapq.heappop(self._ready)
+        return task
+
+    def _work(self, task: Task) -> None:
+        """Run a task without the lock."""
+        self.lock.release()
+        try:
+            task.work()
+        finally:
+            self.lock.acquire()
+            task.end_work()
+
     def _notify_idle(self) -> None:
         self._woken += 1
         self._idle.pop().woken.notify()
 
     def _should_wake_another(self, own: Task) -> bool:
         """Return whether the waiting tasks, and `own` before them, take one worker longer than the threshold."""
-        threshold = REAL_TIME_THRESHOLD_SECONDS if self._real_time else WAKE_THRESHOLD_SECONDS
+        threshold = REAL_TIME_THRESHOLD_SECONDS if self.real_time else WAKE_THRESHOLD_SECONDS
         if time.monotonic() - self._busy_since > BUSY_SECONDS:
             threshold = min(BUSY_THRESHOLD_SECONDS, threshold)
         seconds = own.estimated_seconds
@@ -198,16 +263,10 @@ class Workers:
         self._threads[name] = thread
 
     def _run(self, name: str, me: _Worker) -> None:
-        acquire, release = self.lock.acquire, self.lock.release
         with self.lock:
             self._woken -= 1
             while (task := self._wait_for_task(me)) is not None:
-                release()
-                try:
-                    task.work()
-                finally:
-                    acquire()
-                    task.end_work()
+                self._work(task)
             self._workers.remove(me)
             del self._threads[name]
 
@@ -247,12 +306,23 @@ class Workers:
         with self.lock:
             while self._clients:
                 self._watch.wait(BLOCKED_TIMEOUT_SECONDS)
-                for worker in self._workers:
+                for worker in (self._caller, *self._workers):
                     if worker.has_slot and worker.task is not None and _is_blocked(worker.task):
                         worker.has_slot = False
                         self._free_slots += 1
                 self.wake()
+                if self.real_time:
+                    self._check_sources()
             del self._threads["rosafe watch"]
+
+    def _check_sources(self) -> None:
+        clients = list(self._clients)
+        self.lock.release()
+        try:
+            for client in clients:
+                client.check_source()
+        finally:
+            self.lock.acquire()
 
 
 def _is_blocked(task: Task) -> bool:

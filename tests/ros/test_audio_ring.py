@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from rosafe.component.audio import RING_SECONDS, AudioReader, AudioRing
+from rosafe.component.audio import PAUSE_SECONDS, RING_SECONDS, AudioReader, AudioRing
 from rosafe.sound.windows import MAX_RATE
 from tests.harness import PATIENCE
 
@@ -474,3 +474,62 @@ def test_any_changes_of_the_index(first: int) -> None:
     assert ring.counters.streams == 2 and "its index fell" in lines[-1]
     oldest = max(1, source.index - 11)
     assert readable() == [(f, source.sample(f)) for f in range(oldest, source.index + 1)]
+
+
+# --- blocks that nobody observes ---
+
+
+def test_unobserved_blocks_are_read_together() -> None:
+    """The reader is woken for 0.1 s of sound, or when a block is awaited; no frame is lost or repeated."""
+    ring, rate, block = AudioRing(print), 1000, 8
+    feed, source = ring.connect(), Source(rate=rate, window=2 * block)
+    feed(source.message())
+    reader, woken, got = opened(ring, block), [], list[int]()
+    observed = False
+    reader.is_observed = lambda: observed
+    reader.open(lambda: woken.append(source.index))
+
+    def play(frames: int) -> None:
+        for _ in range(frames // 4):
+            source.index += 4
+            feed(source.message())
+
+    def read() -> int:
+        found = reader.read()
+        if found is None:
+            return 0
+        assert found[1] == len(got) + found[0].shape[1] + 1
+        got.extend(found[0][0].tolist())
+        return found[0].shape[1]
+
+    play(92)
+    assert (woken, reader.waiting) == ([], True)
+    play(16)
+    assert woken == [96, 100, 104, 108], "12 blocks are 0.096 s"
+    assert (reader.waiting, read(), reader.waiting, read()) == (False, 96, True, 8), "at most 12 blocks at once"
+    play(16)
+    assert (woken[4:], ring.catch_up(), woken[4:]) == ([], True, [124])
+    assert (reader.waiting, read(), reader.waiting) == (False, 16, True)
+    assert not ring.catch_up(), "less than a block"
+    observed = True
+    play(16)
+    assert woken[5:] == [128, 132, 136, 140]
+    assert [read(), read(), read()] == [8, 8, 0]
+    assert got == [source.sample(frame) for frame in range(1, 137)]
+
+
+def test_unobserved_blocks_are_read_when_the_sound_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 100.0
+    monkeypatch.setattr("rosafe.component.audio.time.monotonic", lambda: now)
+    ring = AudioRing(print)
+    feed, source = ring.connect(), Source(rate=1000, window=16)
+    feed(source.message())
+    reader = opened(ring, 8)
+    reader.is_observed = lambda: False
+    source.index = 12
+    feed(source.message())
+    assert reader.waiting
+    now += PAUSE_SECONDS / 2
+    assert reader.waiting
+    now += PAUSE_SECONDS
+    assert not reader.waiting

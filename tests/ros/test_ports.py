@@ -248,6 +248,30 @@ def test_signals_are_the_new_frames(afe: Session) -> None:
     assert len(again.gammatone[0].left.dataN) == 2, "channels without frames"
 
 
+def test_short_blocks_that_nobody_observes(afe: Session) -> None:
+    """They are combined, but getSignals and a late subscriber get all that has arrived, and then each block."""
+    block, parameters = 16, {"fb_nChannels": 2}
+    microphone = afe.listen(chunk=block)
+    afe.build(*CHAIN, block=block, bufferSize_s_getSignal=2.0, **parameters)
+    before = int(afe.health(lambda audio: audio["sample rate (Hz)"] != "0")["messages"])
+    signal = noise(30 * block)
+    truth = expected(signal, block, parameters)
+    microphone.play(signal[:, : 7 * block])
+    after = (before + 7, 0)  # after a pause of the sound
+    afe.health(lambda audio: (int(audio["messages"]), int(audio["frames waiting"])) == after)
+    microphone.play(signal[:, 7 * block : 10 * block])
+    afe.health(lambda audio: int(audio["messages"]) == before + 10)
+    signals = afe.ok("getSignals").signals
+    assert {getattr(signals, kind)[0].lastFrameIndex for kind in CORE_REPRESENTATIONS} == {10 * block + 1}
+    np.testing.assert_array_equal(arrays(signals, "ihc")[0], truth["ihc"][0, :, : 10 * block])
+    microphone.play(signal[:, 10 * block : 20 * block])
+    with afe.follow("ihc") as messages:
+        wait_for(lambda: messages[-1].lastFrameIndex == 20 * block + 1, what="what had arrived before")
+        microphone.play(signal[:, 20 * block :])
+        wait_for(lambda: messages[-1].lastFrameIndex == 30 * block + 1, what="the end")
+        assert [m.lastFrameIndex for m in messages][-10:] == [(20 + n) * block + 1 for n in range(1, 11)]
+
+
 def test_repeated_calls_get_each_frame_once(afe: Session) -> None:
     """Called while the tree computes; the joined responses are the result of `rosafe.process`."""
     parameters = {"fb_nChannels": 2}

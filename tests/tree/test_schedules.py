@@ -94,6 +94,7 @@ def use(patch: pytest.MonkeyPatch, threading: Any) -> None:
     """Let the code of the tree use the locks and threads of `threading`."""
     for module in (parameter_updates, history, processor, tree, workers):
         patch.setattr(module, "threading", threading)
+    patch.setattr(workers, "SHORT_TASK_SECONDS", math.inf)  # so that the source's thread also runs the first tasks
 
 
 def run_to_the_end(tree: Tree) -> None:
@@ -129,10 +130,41 @@ def grow(scheduler: Scheduler, count: int) -> Check:
     return check
 
 
-def wake(scheduler: Scheduler, count: int) -> Check:
+def receive(scheduler: Scheduler, count: int) -> Check:
+    """As `wake`, in real time: the thread that adds blocks runs tasks itself if all workers are idle."""
+    return wake(scheduler, count, real_time=True)
+
+
+def receive_until_stop(scheduler: Scheduler, count: int) -> Check:
+    """The tree is stopped while the thread that adds blocks runs its tasks."""
+    log = Log()
+    tree = Tree(log, count, real_time=True)
+    source = Numbers(range(0), ends=False)
+    root = tree.add_input("input", source, 1, 0.0, 0.0)
+    child = tree.add("preProc", "child", "input")
+
+    def play() -> None:
+        for number in range(2):
+            source.numbers.append(number)
+            source.wake()
+
+    player = scheduler.threading.Thread(play, "player")
+    player.start()
+    end(tree)
+    player.join()
+
+    def check() -> None:
+        log.assert_run(root, None, None)
+        log.assert_run(child, None, None)
+        assert sorted(log.ends, key=lambda one: one.name) == [child, root]
+
+    return check
+
+
+def wake(scheduler: Scheduler, count: int, real_time: bool = False) -> Check:
     """A thread adds blocks one by one, and wakes the tree each time."""
     log = Log()
-    tree = Tree(log, count)
+    tree = Tree(log, count, real_time)
     source = Numbers(range(0), ends=False)
     root = tree.add_input("input", source, 1, 0.0, 0.0)
     child = tree.add("preProc", "child", "input")
@@ -316,6 +348,8 @@ scenarios = pytest.mark.parametrize(
     [
         (grow, 1),
         (wake, 1),
+        (receive, 2),
+        (receive_until_stop, 2),
         (without_consumers, 1),
         (shrink, 2),
         (remove_child, 2),
@@ -439,3 +473,18 @@ def test_the_exploration_finds_a_worker_that_is_not_woken(monkeypatch: pytest.Mo
     monkeypatch.setattr(Workers, "wake", lambda self: None)
     with pytest.raises(AssertionError, match="deadlock"):
         go(monkeypatch, wake, 2, 1, WALKS)
+
+
+def test_the_exploration_finds_a_slot_that_is_not_returned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread of the source keeps its slot after its tasks."""
+    release = Workers._release_slot
+
+    def keep(self: Workers, me: Any) -> None:
+        if me is not self._caller:
+            release(self, me)
+
+    monkeypatch.setattr(Workers, "_release_slot", keep)
+    monkeypatch.setattr(Workers, "_check_sources", lambda self: None)  # they would never end
+    monkeypatch.setattr(workers, "SHORT_RUN_SECONDS", 0.0)
+    with pytest.raises(AssertionError, match="deadlock"):
+        go(monkeypatch, receive, 1, 1, WALKS)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -164,6 +166,27 @@ def test_the_port_and_readers_share_the_blocks() -> None:
     np.testing.assert_array_equal(port.array(), np.concatenate(blocks[-3:], axis=-1))
     np.testing.assert_array_equal(new.array(), blocks[-1])
     assert index == 50
+
+
+def test_the_port_window_is_the_same_object_until_a_frame_is_appended() -> None:
+    """Short blocks complete no frame; `derived` then holds what was computed from the window before."""
+    signal = SignalFormat.sound(100.0)
+    history = History([(2,)], signal, 0.1, port_seconds=0.3)
+
+    def window(number: int, frames: int, seconds: float = 0.3) -> Any:
+        history.port_seconds = seconds
+        history.append(Block(number, (np.full((2, frames), float(number)),), 10 * number, signal))
+        return history.port_window()
+
+    first, second, third = window(1, 5), window(2, 0), window(3, 5)
+    assert first.parts is second.parts
+    assert (first.next_index, second.next_index) == (10, 20)
+    assert first.parts[0].select(1) is second.parts[0].select(1)
+    np.testing.assert_array_equal(third.parts[0].array()[1, -11:], [0.0] + [1.0] * 5 + [3.0] * 5)
+    assert window(4, 0, 0.2).parts[0].frames == 20, "the port's length was changed"
+    changed = SignalFormat.sound(200.0)
+    history.append(Block(5, (np.ones((2, 0)),), 50, changed))
+    assert (history.port_window().parts[0].frames, history.port_window().signal) == (40, changed)
 
 
 def test_an_empty_window_costs_no_memory() -> None:

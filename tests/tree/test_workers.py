@@ -138,6 +138,7 @@ class EstimatedTask:
     depth = 0
     blocked_since = 0.0
     removed = False
+    trusted = True
 
     def __init__(self, seconds: float) -> None:
         self.estimated_seconds = seconds
@@ -149,6 +150,9 @@ class EstimatedTask:
         pass
 
     def end_work(self) -> None:
+        pass
+
+    def check_source(self) -> None:
         pass
 
 
@@ -221,8 +225,9 @@ def test_the_pool_is_busy_only_until_all_workers_are_idle() -> None:
 
         wait_for(idle)
 
+    client = EstimatedTask(0.0)
     with lock:
-        workers.add_client()
+        workers.add_client(client)
     first, second = Waiting(), Waiting()
     run(first, second)
     for number, task in enumerate((first, second), 1):
@@ -237,7 +242,7 @@ def test_the_pool_is_busy_only_until_all_workers_are_idle() -> None:
         wait_idle(2)
         assert task.thread is second.thread is not first.thread
     with lock:
-        workers.remove_client()
+        workers.remove_client(client)
     workers.join()
 
 
