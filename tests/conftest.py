@@ -58,6 +58,12 @@ LONGEST_FILES = (  # they begin first, so that no process works on one of them w
     "demo/test_readme.py",
     "dsp/test_kernels.py",
 )
+NO_KERNELS = (  # tests of stages that have no kernel: the same code runs with kernels and without
+    "representations/test_interaural.py",
+    "representations/test_moc.py",
+    "representations/test_pitch.py",
+    "representations/test_transients.py",
+)
 ELSEWHERE = ("aarch64", "nehalem", "clang")  # kernels under qemu, or built by another compiler
 
 generate.ensure_messages()  # test modules import rosAFE.msg and bass.msg at their top
@@ -176,7 +182,7 @@ def _is_variant(item: pytest.Item) -> bool:
 def _deselect_repetitions(items: list[pytest.Item], config: pytest.Config) -> None:
     """Deselect tests with numpy instead of kernels that do not depend on this fixture.
 
-    They check the declared limits of parameters, or select implementations themselves.
+    They check declared limits of parameters, select implementations themselves, or are about stages without a kernel.
     """
 
     def repeated(item: pytest.Item) -> bool:
@@ -184,7 +190,8 @@ def _deselect_repetitions(items: list[pytest.Item], config: pytest.Config) -> No
             return False
         name = item.name.partition("[")[0]
         limits = re.search("invalid|bad_|rejected|wrong_|sample_rates", name)
-        return limits is not None or _implementation(item) is not None
+        without_kernel = str(item.path.relative_to(harness.ROOT / "tests")) in NO_KERNELS
+        return limits is not None or without_kernel or _implementation(item) is not None
 
     kept = [item for item in items if not repeated(item)]
     config.hook.pytest_deselected(items=[item for item in items if repeated(item)])

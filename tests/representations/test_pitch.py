@@ -76,8 +76,9 @@ def test_reference_vectors() -> None:
 
 
 @pytest.mark.parametrize("channels", [1, 2, 5])
-@pytest.mark.parametrize("order", [1, 2, 3, 4, 7, 8, 99])
-@pytest.mark.parametrize("threshold", [0.0, 0.5, 0.7, 1.0])
+@pytest.mark.parametrize(
+    ("order", "threshold"), [(1, 0.0), (2, 0.5), (3, 0.7), (4, 1.0), (7, 0.5), (8, 0.0), (99, 0.7)]
+)
 def test_the_result_follows_the_formula(threshold: float, order: int, channels: int) -> None:
     x = correlations(170, order, channels)
     parameters = {**WIDE, "pi_confThres": threshold, "pi_medianOrder": order}
