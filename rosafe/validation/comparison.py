@@ -113,8 +113,6 @@ class Comparison:
     requires : str
         A module, or a path, without which the comparison is skipped. A package that imports its parts at their first
         use (librosa) is named with the part.
-    short : bool
-        Whether it is part of the short form, which needs no other toolbox.
     """
 
     kind: str
@@ -125,7 +123,11 @@ class Comparison:
     disturbance: Disturbance
     measure: Callable[[Process], Measured | float]
     requires: str = ""
-    short: bool = True
+
+    @property
+    def short(self) -> bool:
+        """Whether it is part of the short form, which needs no other toolbox."""
+        return not self.requires or "/" in self.requires
 
     @property
     def group(self) -> str:
@@ -168,12 +170,11 @@ class Collection:
         tolerance: float,
         disturbance: Disturbance,
         requires: str = "",
-        short: bool = True,
     ) -> Callable[[Callable[[Process], Measured | float]], Callable[[Process], Measured | float]]:
         """Return a decorator that adds a comparison; its arguments are the attributes of `Comparison`."""
 
         def register(measure: Callable[[Process], Measured | float]) -> Callable[[Process], Measured | float]:
-            row = Comparison(kind, subject, source, unit, tolerance, disturbance, measure, requires, short)
+            row = Comparison(kind, subject, source, unit, tolerance, disturbance, measure, requires)
             self.comparisons.append(row)
             return measure
 

@@ -38,7 +38,6 @@ def channels(process: Process, signal: FloatArray, centres: Iterable[float], ban
     1e-5,  # filters with four zeros
     parameter("fb_bwERBs", 1.025),
     requires="gammatone",
-    short=False,
 )
 def slaney_filters(process: Process) -> float:
     filters = importlib.import_module("gammatone.filters")
@@ -55,7 +54,6 @@ def slaney_filters(process: Process) -> float:
     1e-6,
     parameter("fb_bwERBs", 1.023),
     requires="pyfar",
-    short=False,
 )
 def hohmann_filters(process: Process) -> float:
     pyfar = importlib.import_module("pyfar")
@@ -74,7 +72,6 @@ def hohmann_filters(process: Process) -> float:
     0.1,
     scaled("pitch", 1.03),
     requires="librosa.core.pitch",
-    short=False,
 )
 def pyin(process: Process) -> Measured:
     librosa = importlib.import_module("librosa")
@@ -98,7 +95,6 @@ def pyin(process: Process) -> Measured:
     1e-6,
     scaled("spectralFeatures", 1.00001),
     requires="librosa.feature.spectral",
-    short=False,
 )
 def librosa_features(process: Process) -> float:
     librosa = importlib.import_module("librosa")
@@ -120,7 +116,6 @@ def librosa_features(process: Process) -> float:
     0.002,  # the window of the toolbox is periodic
     parameter("ac_K", 2.02),
     requires="python_auditory_toolbox",
-    short=False,
 )
 def correlogram(process: Process) -> Measured:
     auditory_toolbox = importlib.import_module("python_auditory_toolbox.auditory_toolbox")
@@ -143,7 +138,6 @@ def correlogram(process: Process) -> Measured:
     1e-5,
     parameter("fb_bwERBs", 1.025),
     requires="python_auditory_toolbox",
-    short=False,
 )
 def toolbox_filters(process: Process) -> float:
     auditory_toolbox = importlib.import_module("python_auditory_toolbox.auditory_toolbox")
