@@ -21,6 +21,7 @@ COHERENCE_RANGE = 2.6  # decades of 1 - coherence below 1
 LEVEL_CLASSES, LEVEL_STEP = 8, 2.0  # level of a channel above its floor in the window, dB
 CLASSES = COHERENCE_CLASSES * LEVEL_CLASSES
 FLOOR_QUANTILE = 0.02  # of the levels in a window: the floor
+MAX_VALUE = 1e100  # of a feature: sums of larger ones overflow
 MIN_LEVEL = -130.0  # dB, of the ratemap of a sound with full scale 1; channels below have no cues
 
 
@@ -88,6 +89,8 @@ def check_features(features: Mapping[str, Any], channels: int) -> dict[str, Floa
         shape = (2, channels, frames) if kind == "ratemap" else (channels, frames)
         if array.shape != shape:
             raise ValueError(f"features[{kind!r}]: expected shape {shape}, got {short_repr(array.shape)}")
-        if not np.isfinite(array).all():
-            raise ValueError(f"features[{kind!r}]: expected finite numbers, got NaN or infinity")
+        if not (np.abs(array) <= MAX_VALUE).all():
+            raise ValueError(
+                f"features[{kind!r}]: expected finite numbers up to {MAX_VALUE:g}, got larger ones, infinity or NaN"
+            )
     return arrays

@@ -22,6 +22,7 @@ import numpy as np
 
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.input import open_regular
 from rosafe.localization import angles
 from rosafe.localization.mixture import MIN_SALIENCE, Candidate
 from rosafe.localization.tracker import GATE, Tracker
@@ -137,7 +138,7 @@ class NoiseCalibration:
         """
         name = printable(os.fspath(path))
         try:
-            with open(path, "rb") as file:
+            with open_regular(Path(path)) as file:
                 values = json.loads(file.read(_MAX_BYTES))
             if values["format"] != FORMAT:
                 raise ValueError(f"format {short_repr(values['format'])}")
