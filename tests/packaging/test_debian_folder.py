@@ -41,6 +41,20 @@ def test_messages_equal_those_of_the_checkout(tmp_path: Path) -> None:
         assert not [path for path in (tmp_path / "share" / package).rglob("*") if path.is_symlink()]
 
 
+def test_manual_pages(tmp_path: Path) -> None:
+    """Each command has one, with its whole help, and rosafe with that of each subcommand."""
+    env = environment(PYTHONPATH=str(ROOT), SOURCE_DATE_EPOCH="1700000000")
+    done = run(PYTHON, "-m", "debian.manpages", tmp_path / "man", env=env, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    pages = {path.stem: path.read_text("utf-8") for path in (tmp_path / "man").iterdir()}
+    installed = (ROOT / "debian" / f"{name}.manpages" for name in ("rosafe", "python3-rosafe"))
+    assert {Path(line).stem for path in installed for line in path.read_text("utf-8").splitlines()} == set(pages)
+    for program, page in pages.items():
+        assert page.startswith(f".TH {program} 1 2023-11-14 ") and f"usage: {program} [" in page.replace("\\-", "-")
+    subcommands = re.findall(r"^\.SS rosafe (\S+)\n\.nf\nusage: rosafe \1 ", pages["rosafe"], re.MULTILINE)
+    assert subcommands == sorted(path.stem for path in (ROOT / "rosafe" / "commands").glob("[!_]*.py"))
+
+
 @pytest.mark.parametrize("arguments", [["-x"], ["--folder"], ["a", "b"]])
 def test_wrong_arguments(arguments: list[str]) -> None:
     done = run(ROOT / "scripts" / "make-deb", *arguments, env=environment())
