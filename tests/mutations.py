@@ -166,6 +166,20 @@ MUTATIONS = (
         "tests/ros/test_audio_ring.py -k on_its_way",
     ),
     _component(
+        "awaited-blocks-not-read",
+        "audio.py",
+        "return reader.position <= reader.awaited or now",
+        "return now",
+        "tests/ros/test_audio_ring.py -k unobserved",
+    ),
+    _component(
+        "observed-blocks-combined",
+        "audio.py",
+        "        if self.is_observed():\n            return 1\n",
+        "",
+        "tests/ros/test_audio_ring.py -k unobserved",
+    ),
+    _component(
         "clock-step-without-limit",
         "frame_clock.py",
         "step = min(STEP_SECONDS, SLEW * (frame - self._last_output.frame) / self._nominal)",
@@ -642,6 +656,20 @@ MUTATIONS = (
         "            del self.skipped\n",
         "            pass\n",
         "tests/plugins/test_failures.py -k not_return",
+    ),
+    _tree(
+        "plugin-on-receiving-thread",
+        "workers.py",
+        "task is None or not task.trusted or task",
+        "task is None or task",
+        "tests/tree/test_workers.py -k calling_thread",
+    ),
+    _tree(
+        "port-window-not-renewed",
+        "history.py",
+        "                self._port_window = (-1.0, ())\n",
+        "",
+        "tests/tree/test_window.py -k port_window",
     ),
     _tree(
         "slot-returned-twice",

@@ -195,6 +195,62 @@ def test_in_real_time_another_worker_is_woken_for_20_ms_of_work(seconds: list[fl
     assert workers._should_wake_another(own)
 
 
+class RecordedTask(EstimatedTask):
+    """Records the threads that run it."""
+
+    def __init__(self, seconds: float, trusted: bool = True) -> None:
+        super().__init__(seconds)
+        self.trusted = trusted
+        self.threads: list[str] = []
+
+    def work(self) -> None:
+        self.threads.append(threading.current_thread().name)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "own"),
+    [
+        ([RecordedTask(1e-4), RecordedTask(1e-4)], 2),
+        ([RecordedTask(1e-4), RecordedTask(2e-3), RecordedTask(1e-4)], 1),
+        ([RecordedTask(1e-4, trusted=False)], 0),
+        ([RecordedTask(math.inf)], 0),
+    ],
+)
+def test_the_calling_thread_runs_only_short_tasks_of_this_package(tasks: list[RecordedTask], own: int) -> None:
+    lock = threading.RLock()
+    workers = pool.Workers(lock, 1, real_time=True)
+    client = EstimatedTask(0.0)
+    with lock:
+        workers.add_client(client)
+    assert workers.wait_idle(PATIENCE)
+    for task in tasks:
+        task.threads.clear()
+    with lock:
+        for task in reversed(tasks):  # the newest is the first
+            workers.push(task)
+        workers.run_short_tasks()
+        assert [len(task.threads) for task in tasks] == [1] * own + [0] * (len(tasks) - own)
+    wait_for(lambda: all(task.threads for task in tasks))
+    names = [task.threads for task in tasks]
+    assert names == [["MainThread"]] * own + [["rosafe worker 1"]] * (len(tasks) - own)
+    with lock:
+        workers.remove_client(client)
+    workers.join()
+
+
+def test_the_calling_thread_runs_nothing_while_a_worker_computes_or_offline() -> None:
+    for real_time in (True, False):
+        lock = threading.RLock()
+        workers = pool.Workers(lock, 2, real_time)
+        task = RecordedTask(1e-4)
+        with lock:
+            workers._free_slots -= real_time
+            workers.push(task)
+            workers.run_short_tasks()
+            assert task.threads == []
+            workers._free_slots += real_time
+
+
 def test_the_pool_is_busy_only_until_all_workers_are_idle() -> None:
     """The next tasks are run by the worker that worked last."""
 
