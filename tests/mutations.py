@@ -412,6 +412,13 @@ MUTATIONS = (
         "        if False:\n",
         "tests/http_server/test_connections.py",
     ),
+    _http(
+        "http-burst-accepted-at-once",
+        "listener.py",
+        "ACCEPTED_AT_ONCE = 8 ",
+        "ACCEPTED_AT_ONCE = BACKLOG ",
+        "tests/http_server/test_connections.py",
+    ),
     # --- interface
     _interface(
         "interface-nan-default", "service.py", "math.isnan(values[p.name])}", "False}", "tests/interface/test_values.py"

@@ -6,12 +6,15 @@ import asyncio
 import errno
 import functools
 import logging
+import os
+import socket
 
 from aiohttp import web
 
 from rosafe.http_server.connections import Connections, HttpConnection
 
 BACKLOG = 512  # connections that the kernel completes before they are accepted
+ACCEPTED_AT_ONCE = 8  # connections of a burst; otherwise they would all be busy before the first request is handled
 
 
 class ListenError(OSError):
@@ -53,9 +56,13 @@ class HttpListener:
         assert self._runner.server is not None
         connect = functools.partial(HttpConnection, self._connections, self._runner.server, access_log=access_log)
         try:
-            self._listener = await asyncio.get_running_loop().create_server(connect, host, port, backlog=BACKLOG)
+            loop = asyncio.get_running_loop()
+            self._listener = await loop.create_server(connect, host, port, backlog=ACCEPTED_AT_ONCE)
         except (OSError, UnicodeError) as problem:
             raise ListenError(problem, host, port) from None
+        for listening in self._listener.sockets:
+            with socket.socket(fileno=os.dup(listening.fileno())) as same:
+                same.listen(BACKLOG)  # asyncio has one number for both
         return int(self._listener.sockets[0].getsockname()[1])
 
     def stop_listening(self) -> None:

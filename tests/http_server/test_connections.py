@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 from collections.abc import Awaitable, Callable
+from contextlib import ExitStack
+from dataclasses import replace
 
 from aiohttp import web
 
@@ -55,9 +58,9 @@ def _format(refusal: HttpRefusal) -> tuple[bytes, str]:
 class World:
     """A server with the paths /now, /token (authenticates the connection), /poll and /large."""
 
-    def __init__(self) -> None:
+    def __init__(self, limits: Limits) -> None:
         self.connections = Connections(
-            LIMITS, lambda refusal: (str(refusal).encode(), "text/plain"), logging.getLogger()
+            limits, lambda refusal: (str(refusal).encode(), "text/plain"), logging.getLogger()
         )
         self.may_answer = asyncio.Event()
         self.polling = asyncio.Semaphore(0)
@@ -68,7 +71,7 @@ class World:
         self._clients: list[Client] = []
 
     async def __aenter__(self) -> World:
-        self._port = await self._listener.start("127.0.0.1", 0)
+        self.port = await self._listener.start("127.0.0.1", 0)
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -78,7 +81,7 @@ class World:
         await self._listener.close(0.1)
 
     async def connect(self) -> Client:
-        client = Client(*await asyncio.open_connection("127.0.0.1", self._port, limit=65536))
+        client = Client(*await asyncio.open_connection("127.0.0.1", self.port, limit=65536))
         self._clients.append(client)
         return client
 
@@ -117,9 +120,9 @@ class World:
         return response
 
 
-def run(test: Callable[[World], Awaitable[None]]) -> None:
+def run(test: Callable[[World], Awaitable[None]], limits: Limits = LIMITS) -> None:
     async def limited() -> None:
-        async with asyncio.timeout(PATIENCE), World() as world:
+        async with asyncio.timeout(PATIENCE), World(limits) as world:
             await test(world)
 
     asyncio.run(limited())
@@ -151,6 +154,27 @@ def test_authenticated_connections_are_closed_last() -> None:
         assert await authenticated.get("/now") == 200
 
     run(check)
+
+
+def test_a_burst_of_requests_does_not_lock_out_other_clients() -> None:
+    """More requests than an address may have connections arrive before the server has handled the first one."""
+    burst = 128
+
+    async def check(world: World) -> None:
+        for steps in range(12):  # of the event loop, between the burst and the other client
+            with ExitStack() as stack:
+                for _ in range(burst):
+                    one = stack.enter_context(socket.create_connection(("127.0.0.1", world.port)))
+                    one.sendall(b"GET /now HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                for _ in range(steps):
+                    await asyncio.sleep(0)
+                sock = socket.create_connection(("127.0.0.1", world.port))
+                sock.sendall(b"GET /now HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                other = Client(*await asyncio.open_connection(sock=sock))
+                assert await other.status() == 200, steps
+                other.writer.transport.abort()
+
+    run(check, replace(LIMITS, max_connections=burst))
 
 
 def test_answers_that_clients_read_slowly_leave_no_memory_for_others() -> None:
