@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -53,6 +54,25 @@ def test_manual_pages(tmp_path: Path) -> None:
         assert page.startswith(f".TH {program} 1 2023-11-14 ") and f"usage: {program} [" in page.replace("\\-", "-")
     subcommands = re.findall(r"^\.SS rosafe (\S+)\n\.nf\nusage: rosafe \1 ", pages["rosafe"], re.MULTILINE)
     assert subcommands == sorted(path.stem for path in (ROOT / "rosafe" / "commands").glob("[!_]*.py"))
+
+
+@pytest.mark.parametrize("git", [False, True])
+def test_exported_permissions_do_not_depend_on_those_of_the_checkout(tmp_path: Path, git: bool) -> None:
+    """As root, tar keeps those that git stores in an archive; for other users it applies the umask."""
+    checkout, exported = tmp_path / "a checkout", tmp_path / "exported"
+    (checkout / "scripts").mkdir(parents=True)
+    shutil.copy(ROOT / "scripts" / "export-sources", checkout / "scripts")
+    (checkout / "CHANGELOG.md").write_text("0.3.0")
+    if git:
+        commit = ["-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "x"]
+        for arguments in (["init", "-q"], ["add", "."], commit):
+            assert run("git", *arguments, env=environment(), cwd=checkout).returncode == 0
+    (checkout / "CHANGELOG.md").chmod(0o660)
+    (checkout / "scripts" / "export-sources").chmod(0o700)
+    done = run(checkout / "scripts" / "export-sources", exported, env=environment())
+    assert done.returncode == 0, done.stderr
+    modes = {path.name: path.stat().st_mode & 0o777 for path in exported.rglob("*") if ".git" not in path.parts}
+    assert modes == {"CHANGELOG.md": 0o644, "scripts": 0o755, "export-sources": 0o755}
 
 
 @pytest.mark.parametrize("arguments", [["-x"], ["--folder"], ["a", "b"]])
