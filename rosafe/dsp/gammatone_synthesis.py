@@ -110,11 +110,12 @@ def outputs_after_end(
     ears, count, width = channels.shape
     end = (size + width) // 2
     solved, after = slice(end - unknown, end), slice(end, end + length)
-    impulses = np.stack([scipy.fft.irfft(row, size)[:unknown] for row in analysis])
+    whole = [scipy.fft.irfft(row, size) for row in analysis]
+    level = float(sum(np.sum(row**2) for row in whole))
+    impulses = np.stack([row[:unknown] for row in whole])
     gram = impulses.T @ impulses  # between impulses at two distances from the end
     for row in range(1, unknown):
         gram[row, 1:] += gram[row - 1, :-1]
-    level = np.trace(gram) / unknown
     transforms = scipy.fft.rfft(impulses, 2 * unknown).conj()
     tail = np.zeros((ears, count, length))
     padded = np.zeros((ears, size))

@@ -60,6 +60,7 @@ def test_one_ear_and_single_precision_and_files(tmp_path: Any) -> None:
     assert np.array_equal(rosafe.resynthesize(rosafe.load(tmp_path / "one.npz")), found)
 
 
+@pytest.mark.parametrize("rate", [8000, 16000])
 @pytest.mark.parametrize(
     "parameters",
     [
@@ -69,12 +70,19 @@ def test_one_ear_and_single_precision_and_files(tmp_path: Any) -> None:
         {"pp_bMiddleEarFiltering": True, "pp_middleEarModel": "lopezpoveda", "pp_bLevelScaling": True},
     ],
 )
-def test_preprocessing_is_compensated(parameters: dict[str, Any]) -> None:
-    ears = sound(16000)
-    plain = rosafe.process(ears, 16000, parameters=parameters, outputs=["preProc"])["preProc"]
+def test_preprocessing_is_compensated(parameters: dict[str, Any], rate: int) -> None:
+    ears = sound(rate)
+    plain = rosafe.process(ears, rate, parameters=parameters, outputs=["preProc"])["preProc"]
     assert error_db(plain, ears) > -10
-    result = rosafe.process(ears, 16000, parameters=parameters, outputs=["gammatone"])
+    result = rosafe.process(ears, rate, parameters=parameters, outputs=["gammatone"])
     assert error_db(rosafe.resynthesize(result), ears) < -45
+
+
+@pytest.mark.parametrize("rate", [8000, 16000])
+def test_an_abrupt_end_behind_a_filter_with_a_long_delay_is_not_amplified(rate: int) -> None:
+    noise = sound(rate)[:, rate // 5 : rate // 2]
+    result = rosafe.process(noise, rate, parameters={"pp_bMiddleEarFiltering": True}, outputs=["gammatone"])
+    assert np.abs(rosafe.resynthesize(result)).max() < 1.5 * np.abs(noise).max()
 
 
 def test_other_filters() -> None:
