@@ -87,7 +87,8 @@ class EvidenceWindow:
             self._model.add_evidence(total, self._cues, self._floor, frames, channels, factor)
             self._sums[channels] += rotate(total, np.full(len(total), yaw[0]))[channels]
         else:
-            evidence = self._model.terms(*self._model.rows(self._cues.select(frames), self._floor))[:, channels]
+            rows = self._model.rows(self._cues.select(frames), self._floor)
+            evidence = self._model.terms(*(row[:, channels] for row in rows))
             turned = rotate(evidence.reshape(-1, evidence.shape[-1]), np.repeat(yaw, evidence.shape[1]))
             self._sums[channels] += factor * turned.reshape(evidence.shape).sum(axis=0, dtype=np.float64)
 
