@@ -65,6 +65,8 @@ class FrameQueue:
         ready = len(yaw)
         later = joined.select(slice(ready, None))
         self._waiting = [later] if len(later.middles) else []
+        kept = known & ~self._mute.muted(joined.middles[:ready])
+        if not self._waiting and kept.all():  # mostly; copies are saved
+            return TurnedFrames(joined, yaw) if ready else None
         now = joined.select(slice(ready))
-        kept = known & ~self._mute.muted(now.middles)
         return TurnedFrames(now.select(kept), yaw[kept]) if kept.any() else None

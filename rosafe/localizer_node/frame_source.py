@@ -76,6 +76,8 @@ class NewFrames:
     @staticmethod
     def joined(parts: Sequence[NewFrames]) -> NewFrames:
         """Return all frames of `parts`."""
+        if len(parts) == 1:
+            return parts[0]
         features = {
             kind: np.concatenate([part.features[kind] for part in parts], axis=-1) for kind in parts[0].features
         }

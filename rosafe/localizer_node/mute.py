@@ -67,17 +67,21 @@ class Mute:
     @property
     def active(self) -> bool:
         """Whether sound is not used at present."""
+        if not self._intervals:
+            return False
         with self._lock:
             now = self._advance()
             return bool(self._intervals) and self._intervals[-1][1] > now
 
     def muted(self, times: FloatArray) -> NDArray[np.bool_]:
         """Return whether frames at clock times in s are muted."""
+        found = np.zeros(len(times), bool)
+        if not self._intervals:
+            return found
         with self._lock:
             self._advance()
             intervals = list(self._intervals)
         heard = times - self._delay
-        found = np.zeros(len(times), bool)
         for begin, end in intervals:
             found |= (heard >= begin) & (heard <= end)
         return found
