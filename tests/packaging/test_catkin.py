@@ -39,7 +39,8 @@ def workspace(request: pytest.FixtureRequest) -> Iterator[Path]:
         (sources / "rosAFE").symlink_to(copy)
         (sources / "bass").symlink_to(copy / "bass")
         done = run(
-            *("catkin_make", "-C", folder, "install", f"-DPYTHON_EXECUTABLE={PYTHON}"),
+            # replaces the default -j2 -l2, with which make runs single jobs while the load of the machine is above 2
+            *("catkin_make", "-j2", "-C", folder, "install", f"-DPYTHON_EXECUTABLE={PYTHON}"),
             env=environment(HOME=str(folder), ROS_LANG_DISABLE="genlisp:gencpp"),
             cwd=folder,
             seconds=550,
