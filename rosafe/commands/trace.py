@@ -125,21 +125,23 @@ def _listen(node: str, seconds: float) -> list[Event]:
     messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
     become_node("rosafe_trace")
     subscriber = rospy.Subscriber(f"{node}/trace", String, messages.put, tcp_nodelay=True)
-    events: list[Event] = []
+    received: list[Any] = []
     try:
         try:
-            events += read(messages.get(timeout=_ANSWER_SECONDS))
+            received.append(messages.get(timeout=_ANSWER_SECONDS))
         except queue.Empty:
             raise CommandError(f"{node} does not publish a trace; check that a rosAFE-ros has this name") from None
         deadline = time.monotonic() + seconds
         while (left := deadline - time.monotonic()) > 0:
-            events += read(messages.get(timeout=left + _ANSWER_SECONDS))
+            received.append(messages.get(timeout=left + _ANSWER_SECONDS))
     except queue.Empty:
         print(f"rosafe trace: {printable(node)} has stopped publishing", file=sys.stderr)
     except KeyboardInterrupt:
-        if not events:
+        if not received:
             raise
         print("rosafe trace: ended early", file=sys.stderr)
     finally:
         subscriber.unregister()
-    return events
+    while not messages.empty():  # received before Ctrl-C
+        received.append(messages.get())
+    return [event for message in received for event in read(message)]

@@ -5,19 +5,25 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import queue
 import signal
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 import rosgraph
 import rospy
 import soundfile
 from std_msgs.msg import String
 
+from rosafe.commands import trace
+from rosafe.component import startup
 from rosafe.interface import CORE_REPRESENTATIONS
+from rosafe.node import trace_port
 from rosafe.node.trace_port import TracePort, read
 from rosafe.tree.context import Observer
 from rosafe.tree.states import State
@@ -88,6 +94,33 @@ def test_a_real_run_shows_simultaneous_parents_children_and_siblings(afe: Sessio
     assert "gammatone and ihc" in command.out and f"written to {path}" in command.out
     assert "ended early" in command.err
     afe.ok("getParameters")
+
+
+def test_messages_received_before_an_interrupt_are_part_of_the_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Interrupted(queue.SimpleQueue[int]):
+        """Ctrl-C arrives before the second message is taken."""
+
+        waits = 0
+
+        def get(self, block: bool = True, timeout: float | None = None) -> int:
+            self.waits += timeout is not None
+            if self.waits == 2 and timeout is not None:
+                raise KeyboardInterrupt
+            return super().get(block, timeout)
+
+    class Subscriber:
+        def __init__(self, topic: str, message_class: Any, callback: Callable[[int], None], **options: Any) -> None:
+            for message in range(3):
+                callback(message)
+
+        def unregister(self) -> None:
+            pass
+
+    monkeypatch.setattr(rospy, "Subscriber", Subscriber)
+    monkeypatch.setattr(startup, "become_node", lambda name: None)
+    monkeypatch.setattr(trace_port, "read", lambda message: [message])
+    monkeypatch.setattr(trace, "queue", SimpleNamespace(SimpleQueue=Interrupted, Empty=queue.Empty))
+    assert trace._listen("/rosAFE", 100.0) == [0, 1, 2]
 
 
 def test_a_killed_trace_ends_tracing_in_the_node(afe: Session) -> None:
