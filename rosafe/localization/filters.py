@@ -38,7 +38,7 @@ class HeadFilters:
         self.azimuths = azimuths
         self.responses = responses
         self.size = scipy.fft.next_fast_len(HOP + responses.shape[2], real=True)
-        self._delays = onset_delays(responses)
+        self._delays = np.array([onset_delays(pair) for pair in responses])  # all at once needs much memory
         self._phase = -2j * np.pi * np.fft.rfftfreq(self.size, 1.0)
         self._aligned = np.fft.rfft(responses, self.size) * np.exp(-self._phase * self._delays[..., np.newaxis])
 

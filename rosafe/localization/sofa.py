@@ -5,6 +5,7 @@ AES69-2022, "AES standard for file exchange - Spatial acoustic data file format"
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,8 @@ CONVENTION = "SimpleFreeFieldHRIR"
 MAX_FILE_BYTES = 1 << 30
 MAX_RESPONSES = 100_000
 MAX_LENGTH = 16384  # samples of an impulse response
+MAX_DIRECTIONS = 720  # in the horizontal plane
+MIN_PEAK, MAX_PEAK = 1e-6, 1e6  # of a response
 MIN_RATE, MAX_RATE = 8000.0, 768_000.0  # Hz
 MAX_ELEVATION = 1.0  # degrees; positions up to here belong to the horizontal plane
 MAX_GAP = 30.0  # degrees between neighbouring directions
@@ -99,15 +102,21 @@ class _SofaReader:
             value = value.flat[0] if value.size else b""
         return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
-    def _array(self, key: str, dimensions: int) -> FloatArray:
+    def _variable(self, key: str) -> Any:
+        """Return a dataset of real numbers."""
         self._expect(key in self._content, f"the variable {key}", "none")
         data = self._content[key]
-        shape: Any = getattr(data, "shape", None)
-        self._expect(shape is not None and data.dtype.kind in "fiu", f"numbers in {key}", "something else")
+        kind = data.dtype.kind if hasattr(data, "dtype") else ""
+        self._expect(bool(kind) and kind in "fiu", f"real numbers in {key}", "something else")
+        return data
+
+    def _array(self, key: str, dimensions: int) -> FloatArray:
+        data = self._variable(key)
+        shape = data.shape
         self._expect(
-            len(shape) == dimensions and int(np.prod(shape)) <= 2 * MAX_RESPONSES * MAX_LENGTH,
-            f"{key} with {dimensions} dimensions",
-            f"shape {tuple(shape)}",
+            len(shape) == dimensions and 0 < math.prod(shape) <= 3 * MAX_RESPONSES,
+            f"{key} with {dimensions} dimensions and up to {3 * MAX_RESPONSES} numbers",
+            f"shape {shape}",
         )
         values = np.asarray(data[()], np.float64)
         self._expect(bool(np.isfinite(values).all()), f"finite numbers in {key}", "NaN or infinity")
@@ -120,12 +129,12 @@ class _SofaReader:
             f"the SOFA convention {CONVENTION}",
             short_repr(convention) if convention else "none",
         )
-        data = self._content.get("Data.IR")
-        shape: Any = getattr(data, "shape", ())
+        data = self._variable("Data.IR")
+        shape = data.shape
         self._expect(
             len(shape) == 3 and shape[1] == 2 and 0 < shape[0] <= MAX_RESPONSES and 16 <= shape[2] <= MAX_LENGTH,
             f"Data.IR of shape (M, 2, N), M up to {MAX_RESPONSES}, N from 16 to {MAX_LENGTH}",
-            f"shape {tuple(shape)}" if shape else "none",
+            f"shape {shape}",
         )
         rate = float(self._array("Data.SamplingRate", 1)[0])
         self._expect(MIN_RATE <= rate <= MAX_RATE, f"a sample rate from {MIN_RATE:g} to {MAX_RATE:g} Hz", f"{rate:g}")
@@ -133,7 +142,12 @@ class _SofaReader:
         ears = self._ears()
         responses = self._rows(data, rows)[:, ears]
         self._expect(bool(np.isfinite(responses).all()), "finite numbers in Data.IR", "NaN or infinity")
-        self._expect(bool(np.any(responses, axis=2).all()), "responses that are not all zero", "silent ones")
+        peaks = np.abs(responses).max(axis=2)
+        self._expect(
+            bool((peaks >= MIN_PEAK).all() and (peaks <= MAX_PEAK).all()),
+            f"responses with a peak from {MIN_PEAK:g} to {MAX_PEAK:g}",
+            f"{peaks.min():g} to {peaks.max():g}",
+        )
         return HorizontalResponses(azimuths, self._delayed(responses, rows, ears), rate)
 
     @staticmethod
@@ -146,13 +160,15 @@ class _SofaReader:
 
     def _positions(self, key: str) -> FloatArray:
         """Return positions (M, 3) in Cartesian coordinates (m)."""
-        data = self._content.get(key)
-        self._expect(data is not None, f"the variable {key}", "none")
+        data = self._variable(key)
         values = self._array(key, len(data.shape))
         values = values[..., 0] if values.ndim == 3 else values
         self._expect(values.ndim == 2 and values.shape[1] == 3, f"{key} with 3 coordinates", f"shape {data.shape}")
-        if self._text(data.attrs, "Type").strip().lower() != "spherical":
+        kind, units = (self._text(data.attrs, name).strip().lower() for name in ("Type", "Units"))
+        self._expect(kind in ("spherical", "cartesian", ""), f"spherical or cartesian {key}", short_repr(kind))
+        if kind != "spherical":
             return values
+        self._expect(units.startswith("degree") or not units, f"{key} in degrees and metres", short_repr(units))
         azimuth, elevation = np.radians(values[:, 0]), np.radians(values[:, 1])
         flat = np.cos(elevation)
         unit = np.stack((np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)), axis=1)
@@ -184,6 +200,9 @@ class _SofaReader:
             len(azimuths) > 1 and gap <= MAX_GAP,
             f"directions all around the head, at most {MAX_GAP:g} degrees apart",
             f"a gap of {gap:g} degrees",
+        )
+        self._expect(
+            len(azimuths) <= MAX_DIRECTIONS, f"at most {MAX_DIRECTIONS} directions in the horizontal plane", len(azimuths)
         )
         return rows[first], azimuths
 
@@ -217,7 +236,9 @@ class _SofaReader:
             return responses
         self._expect(float(delays.max()) <= MAX_LENGTH, f"delays of at most {MAX_LENGTH} samples", f"{delays.max():g}")
         length = responses.shape[2] + int(np.ceil(delays.max())) + 32
-        size = 2 * length
-        phase = np.exp(-2j * np.pi * np.fft.rfftfreq(size, 1.0) * delays[..., np.newaxis])
-        shifted = np.fft.irfft(np.fft.rfft(responses, size) * phase, size)[..., :length]
-        return np.asarray(shifted)
+        turns = np.fft.rfftfreq(2 * length, 1.0)
+        shifted = np.empty((len(responses), 2, length))
+        for both, pair, delay in zip(shifted, responses, delays, strict=True):  # one direction at a time: less memory
+            spectrum = np.fft.rfft(pair, 2 * length) * np.exp(-2j * np.pi * turns * delay[:, np.newaxis])
+            both[:] = np.fft.irfft(spectrum, 2 * length)[:, :length]
+        return shifted

@@ -26,6 +26,8 @@ def write_sofa(path: Path, change: Callable[[dict[str, Any]], None] = lambda val
         responses[row, [0, 1], pair + 4] = 1.0
     values = {
         "convention": "SimpleFreeFieldHRIR",
+        "position_type": "spherical",
+        "position_units": "degree, degree, metre",
         "Data.IR": responses,
         "Data.SamplingRate": np.array([44100.0]),
         "Data.Delay": np.zeros((1, 2)),
@@ -35,11 +37,14 @@ def write_sofa(path: Path, change: Callable[[dict[str, Any]], None] = lambda val
     change(values)
     with h5py.File(path, "w") as file:
         file.attrs["SOFAConventions"] = values.pop("convention")
+        kind, units = values.pop("position_type"), values.pop("position_units")
         for name, value in values.items():
-            if value is not None:
+            if isinstance(value, dict):
+                file.create_group(name)
+            elif value is not None:
                 file[name] = value
         if "SourcePosition" in file:
-            file["SourcePosition"].attrs["Type"] = "spherical"
+            file["SourcePosition"].attrs.update({"Type": kind, "Units": units})
     return path
 
 
@@ -142,15 +147,21 @@ def _set(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
     [
         (_set("convention", "GeneralFIR"), "expected the SOFA convention SimpleFreeFieldHRIR, got 'GeneralFIR'"),
         (_set("Data.IR", lambda ir: ir[:, :1]), "Data.IR of shape"),
-        (_set("Data.IR", None), "Data.IR of shape"),
+        (_set("Data.IR", None), "the variable Data.IR, got none"),
         (_set("Data.IR", lambda ir: ir * np.nan), "finite numbers"),
-        (_set("Data.IR", lambda ir: ir * 0), "not all zero"),
+        (_set("Data.IR", lambda ir: ir * 0), "a peak from 1e-06 to 1e+06, got 0"),
+        (_set("Data.IR", lambda ir: ir * 1e200), "a peak from"),
+        (_set("Data.IR", lambda ir: ir.astype(complex)), "real numbers in Data.IR"),
+        (_set("Data.IR", lambda ir: ir.astype("S")), "real numbers in Data.IR"),
         (_set("Data.SamplingRate", np.array([10.0])), "sample rate"),
         (_set("SourcePosition", lambda p: p + np.array([0, 45, 0])), "horizontal plane"),
         (_set("SourcePosition", lambda p: p * np.array([0.4, 1, 1])), "a gap of"),
         (_set("SourcePosition", lambda p: p[:5]), "36 rows in SourcePosition"),
         (_set("ReceiverPosition", np.zeros((2, 3, 1))), "one receiver on the left"),
         (_set("Data.Delay", np.array([[0.0, 1e9]])), "delays of at most"),
+        (_set("SourcePosition", {}), "real numbers in SourcePosition"),
+        (_set("position_type", "cylindrical"), "spherical or cartesian SourcePosition, got 'cylindrical'"),
+        (_set("position_units", "radian, radian, metre"), "degrees and metres, got 'radian, radian, metre'"),
     ],
 )
 def test_unsuitable_files_are_rejected(tmp_path: Path, change: Callable[[dict[str, Any]], None], message: str) -> None:
@@ -159,6 +170,30 @@ def test_unsuitable_files_are_rejected(tmp_path: Path, change: Callable[[dict[st
         rosafe.Head.from_sofa(path)
     text = str(caught.value)
     assert text.startswith(f"{path}: ") and message in text and "\n" not in text
+
+
+@pytest.mark.parametrize("name", ["Data.SamplingRate", "Data.Delay", "SourcePosition", "Data.IR"])
+def test_absurd_dimensions_are_refused_before_memory_is_allocated(tmp_path: Path, name: str) -> None:
+    path = write_sofa(tmp_path / "large.sofa")
+    with h5py.File(path, "r+") as file:
+        first = file[name].shape[:-1]
+        shape = (*(2**31 if size > 2 else size for size in first), 2**33 if first else 2**31)
+        attributes = dict(file[name].attrs)
+        del file[name]
+        file.create_dataset(name, shape, "f8", chunks=(1,) * len(shape)).attrs.update(attributes)  # nothing is stored
+    with pytest.raises(ValueError, match=f"{name} "):
+        rosafe.Head.from_sofa(path)
+
+
+def test_the_number_of_directions_is_limited(tmp_path: Path) -> None:
+    count = 721
+
+    def many(values: dict[str, Any]) -> None:
+        values["Data.IR"] = np.ones((count, 2, 16))
+        values["SourcePosition"] = np.stack((np.arange(count) * 360 / count, np.zeros(count), np.ones(count)), 1)
+
+    with pytest.raises(ValueError, match="at most 720 directions in the horizontal plane, got 721"):
+        rosafe.Head.from_sofa(write_sofa(tmp_path / "many.sofa", many))
 
 
 def test_other_files_are_rejected(tmp_path: Path) -> None:
