@@ -202,7 +202,9 @@ class _SofaReader:
             f"a gap of {gap:g} degrees",
         )
         self._expect(
-            len(azimuths) <= MAX_DIRECTIONS, f"at most {MAX_DIRECTIONS} directions in the horizontal plane", len(azimuths)
+            len(azimuths) <= MAX_DIRECTIONS,
+            f"at most {MAX_DIRECTIONS} directions in the horizontal plane",
+            len(azimuths),
         )
         return rows[first], azimuths
 

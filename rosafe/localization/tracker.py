@@ -24,14 +24,18 @@ GATE = 15.0  # degrees between a track and its candidate, at most
 _MEASUREMENT_STD = 3.0  # degrees, of a candidate
 _VELOCITY_STD = 15.0  # degrees/s, of a new track
 _ACCELERATION_STD = 8.0  # degrees/s per square root of a second
+_NEW_SHARE = 0.15  # of a candidate of a source that is not known yet; noise without a direction gives smaller peaks
+_IMAGE_SHARE = 0.25  # of a candidate at the front-back image of a source with more evidence
+_IMAGE_WIDTH = 6.0  # degrees of lateral angle between a source and its image, at most
+_IMAGE_RATIO = 0.5  # mean share of an image, at least, relative to that of the source
 _BIRTH = -2.0  # log-odds of a new track
 _MAX_LOG_ODDS = 2.2
-_GAIN, _MAX_GAIN = 8.0, 1.5  # log-odds per share of a candidate above the threshold, and at most
-_LOSS = 0.7  # log-odds for each update without a candidate
+_GAIN, _MAX_GAIN = 8.0, 1.5  # log-odds per share above the needed one, and at most
+_LOSS = 0.7  # log-odds for each update with a smaller share
 MIN_LEVEL_DB = -200.0  # level of silence
 _COURSE = 20  # updates in which a source moves or does not
 _MOVED = 8.0  # degrees in these updates: a source that moves
-_IMAGE_RATIO = 0.6  # share of a candidate at the front-back image of a source, relative to that of the source
+_SHARE_RATE = 0.2  # of the mean share of a track
 
 
 class Track:
@@ -45,7 +49,9 @@ class Track:
         When a candidate supported it first and last, s.
     state : ndarray, (2,)
         Azimuth (degrees) and angular velocity (degrees/s).
-    share, power : float
+    share : float
+        Mean over the last half second.
+    power : float
         Of the last candidate.
     """
 
@@ -91,18 +97,13 @@ class Track:
         gain = self._covariance[:, 0] / (self._covariance[0, 0] + _MEASUREMENT_STD**2)
         self.state = self.state + gain * innovation
         self._covariance = self._covariance - np.outer(gain, self._covariance[0])
-        self.share, self.power = candidate.share, candidate.power
+        self.power = candidate.power
         self.last_time = time
-        self.support(candidate.share)
 
-    def support(self, share: float) -> None:
-        """Raise the probability by the share of a candidate."""
-        gain = min(_MAX_GAIN, _GAIN * (share - MIN_SHARE))
+    def support(self, excess: float) -> None:
+        """Raise the probability by the `excess` of the share over the needed one; lower it if that is not positive."""
+        gain = min(_MAX_GAIN, _GAIN * excess) if excess > 0 else -_LOSS
         self.log_odds = min(_MAX_LOG_ODDS, self.log_odds + gain)
-
-    def miss(self) -> None:
-        """Lower the probability, without a candidate."""
-        self.log_odds -= _LOSS
 
     def follow(self, yaw: float) -> None:
         """Add the present azimuth to those that show whether the source moves."""
@@ -157,16 +158,19 @@ class Tracker:
             track.follow(yaw)
         self._time = time
         matched = self._assign(candidates)
+        shares = [0.0] * len(self.tracks)  # evidence for each track
         for index, track in enumerate(self.tracks):
             if index in matched:
                 track.correct(candidates[matched[index]], time)
+                shares[index] = candidates[matched[index]].share
             elif (other := self._shared(track, candidates)) is not None:
-                track.support(MIN_SHARE + (other.share - MIN_SHARE) / 2)
-            else:
-                track.miss()
+                shares[index] = MIN_SHARE + (other.share - MIN_SHARE) / 2
+            track.share += _SHARE_RATE * (shares[index] - track.share)
+        for share, track in zip(shares, self.tracks, strict=True):
+            track.support(share - self._needed_share(track, yaw))
         taken = set(matched.values())
         for index, candidate in enumerate(candidates):
-            if index not in taken and self._is_new(candidate, yaw):
+            if index not in taken and candidate.share > _NEW_SHARE and self._is_new(candidate):
                 self.tracks.append(Track(candidate, time))
         self._remember(time)
 
@@ -190,17 +194,29 @@ class Tracker:
                     return candidate
         return None
 
-    def _is_new(self, candidate: Candidate, yaw: float) -> bool:
-        """Return whether a candidate starts a track: it is neither near one nor the image of a stronger one."""
-        for track in self.tracks:
-            if abs(float(angles.difference(candidate.azimuth, track.state[0]))) < SEPARATION:
-                return False
-            laterals = angles.lateral(np.array([candidate.azimuth, track.state[0]]) - yaw)
-            image = abs(float(laterals[0] - laterals[1])) < SEPARATION
-            at_pole = abs(float(laterals[0])) < SEPARATION  # near 0 and 180 degrees, which ears hardly distinguish
-            if image and track.id and (at_pole or candidate.share < _IMAGE_RATIO * track.share):
-                return False
-        return True
+    def _is_new(self, candidate: Candidate) -> bool:
+        """Return whether no track is near a candidate."""
+        azimuths = np.array([track.state[0] for track in self.tracks])
+        return bool((np.abs(angles.difference(candidate.azimuth, azimuths)) >= SEPARATION).all())
+
+    def _needed_share(self, track: Track, yaw: float) -> float:
+        """Return the share that raises the probability of a track: more for the front-back image of another one.
+
+        Near 0 and 180 degrees, which ears hardly distinguish, only one of both remains.
+        """
+        needed = MIN_SHARE if track.id else _NEW_SHARE
+        for other in self.tracks:
+            laterals = angles.lateral(np.array([track.state[0], other.state[0]]) - yaw)
+            near = abs(float(angles.difference(track.state[0], other.state[0]))) < SEPARATION
+            if near or abs(float(laterals[0] - laterals[1])) >= _IMAGE_WIDTH:
+                continue
+            lead = bool(track.id) - bool(other.id)
+            at_pole = abs(float(laterals[0])) < SEPARATION
+            if track.share < other.share * _IMAGE_RATIO ** (lead if at_pole else 1):
+                return math.inf
+            if track.share < other.share or lead < 0:
+                needed = _IMAGE_SHARE
+        return needed
 
     def _remember(self, time: float) -> None:
         kept = []

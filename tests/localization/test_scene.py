@@ -142,6 +142,15 @@ def test_wrong_scenes_are_rejected(tmp_path: Path, text: str, message: str) -> N
     assert message in str(caught.value)
 
 
+def test_a_list_may_have_10000_points(tmp_path: Path) -> None:
+    def text(count: int) -> str:
+        return "sources: [{signal: noise, azimuth: [" + ",".join(f"[{n},0]" for n in range(count)) + "]}]"
+
+    assert len(read_scene(scene_file(tmp_path, text(10_000))).sources[0].azimuth.times) == 10_000
+    with pytest.raises(SceneError, match="expected 1 to 10000 points, got 10001"):
+        read_scene(scene_file(tmp_path, text(10_001)))
+
+
 def test_the_device(tmp_path: Path) -> None:
     path = scene_file(tmp_path, "duration: 0.1\nsources: [{signal: tone}]")
     source = open_source(f"scene:{path}", 0, 2000, threading.Event())

@@ -56,6 +56,42 @@ def test_crossing_sources_keep_their_numbers() -> None:
         assert abs(track["azimuth"][-1]) > 30
 
 
+def present_at_end(shares: list[dict[float, float]]) -> list[float]:
+    """Return the azimuths of the sources that are present after updates with the shares of candidates by azimuth."""
+    tracker = Tracker()
+    for number, now in enumerate(shares):
+        tracker.update([Candidate(azimuth, share) for azimuth, share in now.items()], 0.1 * number)
+    return sorted(round(track.azimuth) for track in tracker.present())
+
+
+def test_an_image_that_appears_with_its_source_is_not_a_source() -> None:
+    assert present_at_end([{30.0: 0.45, 150.0: 0.24}] * 20) == [30]
+    assert present_at_end([{-10.0: 0.45, -170.0: 0.4}] * 20) == [-10]
+    assert present_at_end([{-150.0: 0.6}] * 5 + [{-150.0: 0.1, -30.0: 0.6}] * 30) == [-30]  # it was the image
+
+
+def test_mirrored_sources_with_similar_evidence_are_both_found() -> None:
+    assert present_at_end([{30.0: 0.4, 150.0: 0.3}] * 20) == [30, 150]
+    assert present_at_end([{80.0: 0.5, 108.0: 0.2}] * 20) == [80, 108]  # mirrored to 72: not the image of 80
+
+
+def test_a_known_source_needs_less_evidence() -> None:
+    weak = {30.0: 0.6, -20.0: 0.13}
+    assert present_at_end([weak] * 40) == [30]
+    assert present_at_end([{30.0: 0.5, -20.0: 0.3}] * 10 + [weak] * 40) == [-20, 30]
+    assert present_at_end([{30.0: 0.5, -20.0: 0.3}] * 10 + [{30.0: 0.6}] * 20) == [30]
+
+
+def test_a_talker_in_noise_has_no_image(kemar_model: Path, kemar: rosafe.Head) -> None:
+    random = np.random.default_rng(7)
+    noise = 0.01 * random.standard_normal((2, 4 * RATE))
+    for azimuth in (-170, -50, 10, 110):
+        sound = kemar.render(modulated(4.0, 3), RATE, azimuth)
+        tracks = rosafe.localize(sound + noise * np.std(sound) / 0.03, RATE, kemar_model)["tracks"]
+        azimuths = [float(np.median(track["azimuth"])) for track in tracks]
+        assert len(azimuths) == 1 and abs(azimuths[0] - azimuth) < 10
+
+
 def test_two_talkers(kemar_model: Path, kemar: rosafe.Head) -> None:
     sound = kemar.render(modulated(4.0, 1), RATE, 40) + kemar.render(modulated(4.0, 2), RATE, -20)
     tracks = rosafe.localize(sound, RATE, kemar_model)["tracks"]
