@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ def test_complete_installation() -> None:
     assert done.returncode == 0, done
     found = findings(done)
     assert list(found) == EVERYTHING
-    assert "3.11" in found["python"]["detail"] and "/usr/bin/python3" in found["python"]["detail"]
+    assert platform.python_version() in found["python"]["detail"] and "/usr/bin/python3" in found["python"]["detail"]
     assert "numpy" in found["numbers"]["detail"] and "scipy" in found["numbers"]["detail"]
     assert found["alsaaudio"]["state"] == "ok" and str(paths.PYPI_DIR) in found["alsaaudio"]["detail"]
     assert found["master"]["state"] == "note" and "roscore" in found["master"]["detail"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import threading
 import tracemalloc
@@ -291,7 +292,9 @@ def test_unneeded_kinds_are_not_computed(kind: str, monkeypatch: pytest.MonkeyPa
         raise AssertionError("not asked for")
 
     for other in set(STAGES) - set(needed):
-        monkeypatch.setitem(STAGES, other, refuse)  # type: ignore[misc]
+        stage = functools.partial(refuse)
+        stage.effective_values = STAGES[other].effective_values  # type: ignore[attr-defined]  # parameters are checked
+        monkeypatch.setitem(STAGES, other, stage)  # type: ignore[misc]
     results = rosafe.process(SOUND, RATE, parameters=FEW, outputs=[kind])
     coordinates = {f"{kind}_time", *(["fb_cfHz"] if "gammatone" in needed else [])}
     if kind in FRAMED:
