@@ -170,7 +170,7 @@ class AudioRing:
         self._times.begin(sample_rate)
         self.counters.streams += 1
         for reader in self._readers:
-            reader.position = self._frames.oldest
+            reader.position, reader.awaited = self._frames.oldest, 0
 
     def _drop_unread(self) -> None:
         unread = self._max_unread()

@@ -186,7 +186,8 @@ class Workers:
         """
         me = self._caller
         me.refusals = max(0, me.refusals - 1)
-        if self.real_time and not me.refusals and self._free_slots == self.count and not self._woken:
+        idle = self._free_slots == self.count and not self._woken and me.task is None
+        if self.real_time and idle and not me.refusals:
             me.has_slot, self._free_slots = True, self._free_slots - 1
             end = time.monotonic() + SHORT_RUN_SECONDS
             while me.has_slot and (task := self._pop_short_task()) is not None:

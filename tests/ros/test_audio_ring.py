@@ -516,6 +516,9 @@ def test_unobserved_blocks_are_read_together() -> None:
     assert woken[5:] == [128, 132, 136, 140]
     assert [read(), read(), read()] == [8, 8, 0]
     assert got == [source.sample(frame) for frame in range(1, 137)]
+    observed, source.index = False, 20  # a new stream, whose frames were not awaited
+    feed(source.message())
+    assert reader.waiting
 
 
 def test_unobserved_blocks_are_read_when_the_sound_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
