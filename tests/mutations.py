@@ -471,8 +471,8 @@ MUTATIONS = (
     _localization(
         "tracker-never-forgets",
         "tracker.py",
-        "        self.log_odds -= _LOSS\n",
-        "        pass\n",
+        "if excess > 0 else -_LOSS",
+        "if excess > 0 else 0.0",
         "tests/localization/test_tracker.py",
     ),
     _localization(

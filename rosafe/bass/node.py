@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import threading
+from collections.abc import Callable
 from typing import Any, cast
 
 import rospy
@@ -25,6 +26,17 @@ from rosafe.terminal import printable
 from rosafe.transport import master
 from rosafe.transport.log_throttle import ThrottledLog
 from rosafe.transport.publisher import Publisher
+
+FRAMES: tuple[str, ...] = ("world", "head")  # default names of coordinate frames
+
+
+def _coordinate_frames() -> tuple[str, ...]:
+    """Return the names of the world's and the head's coordinate frames; without a master, the defaults."""
+    try:
+        # tf2 has no leading slash
+        return tuple(str(rospy.get_param(f"~{name}_frame", name)).strip("/") or name for name in FRAMES)
+    except master.FAILURES:
+        return FRAMES
 
 
 class BassNode:
@@ -71,7 +83,9 @@ class BassNode:
         # All steps that can fail precede the end of the running acquisition, so that an error does not stop it.
         source = self._open(activity, device, values["sampleRate"], frames_per_chunk)
         try:
-            truth = self._truth_of(source)
+            truth = self._truth_of(source, activity.stop_requested.is_set)
+            if truth is None:
+                return
             capture = Capture(source, frames_per_chunk, chunks, self._publish, self._note_loss)
             activity.interrupt_others()
             activity.raise_if_interrupted()
@@ -93,14 +107,18 @@ class BassNode:
                 self._source = None
             source.close()
 
-    def _truth_of(self, source: SoundSource) -> contextlib.AbstractContextManager[object]:
-        """Return a context in which the true directions of a scene are published; ComponentError for wrong names."""
+    def _truth_of(
+        self, source: SoundSource, give_up: Callable[[], bool]
+    ) -> contextlib.AbstractContextManager[object] | None:
+        """Return a context in which the true directions of a scene are published; None if it was given up.
+
+        Raises ComponentError for unsuitable names of coordinate frames.
+        """
         if not hasattr(source, "truth"):
             return contextlib.nullcontext()
-        frames: tuple[str, ...] = ("world", "head")
-        with contextlib.suppress(*master.FAILURES):  # without a master, the defaults
-            # tf2 has no leading slash
-            frames = tuple(str(rospy.get_param(f"~{name}_frame", name)).strip("/") or name for name in frames)
+        frames = master.bounded(_coordinate_frames, FRAMES, give_up)  # the master may hang
+        if give_up():
+            return None
         if frames[0] == frames[1]:
             raise BASS.error("e_hwparams", f"world_frame: expected another frame than head_frame, got {frames[0]!r}")
         return TruthPublisher(cast(TruthSource, source), self._truth, self._truth_class, frames)

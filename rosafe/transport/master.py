@@ -90,7 +90,7 @@ def _addresses(host: str) -> list[str]:
         except (OSError, UnicodeError):
             return []
 
-    return _bounded(resolve, [])
+    return bounded(resolve, [])
 
 
 def _is_own(address: str) -> bool:
@@ -125,12 +125,12 @@ def check_address(uri: str) -> None:
 def check_master(uri: str, give_up: Callable[[], bool] = lambda: False) -> None:
     """Raise MasterError if no ROS master answers at `uri` within a few seconds and before `give_up()` returns True."""
     check_address(uri)
-    problem = _bounded(lambda: _ask(uri), "no answer", give_up)
+    problem = bounded(lambda: _ask(uri), "no answer", give_up)
     if problem:
         raise _error(uri, problem)
 
 
-def _bounded(call: Callable[[], T], default: T, give_up: Callable[[], bool] = lambda: False) -> T:
+def bounded(call: Callable[[], T], default: T, give_up: Callable[[], bool] = lambda: False) -> T:
     """Return `call()`, or `default` after `RESOLVE_SECONDS`: name resolution has no other time limit."""
     results: list[T] = []
     thread = threading.Thread(target=lambda: results.append(call()), daemon=True)

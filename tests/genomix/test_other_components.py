@@ -209,7 +209,7 @@ def test_a_large_message_does_not_delay_other_requests(size: int) -> None:
             return threading.current_thread()
 
     thread = asyncio.run(tcpros.decode(Message(), bytearray(size)))
-    assert (thread is threading.main_thread()) == (size < tcpros.LARGE)
+    assert (thread is threading.current_thread()) == (size < tcpros.LARGE)
 
 
 def test_octave(robot: World) -> None:

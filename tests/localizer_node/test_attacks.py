@@ -262,7 +262,8 @@ def test_files_that_block(graph: Graph, tmp_path: Path) -> None:
     """A FIFO without a writer, for both files."""
     os.mkfifo(tmp_path / "fifo")
     for option in ("--noise", "--head"):
-        done = graph.run("scripts/rosafe", "localize", option, str(tmp_path / "fifo"), check=False)
+        file = str(tmp_path / "fifo")
+        done = graph.run("scripts/rosafe", "localize", "--name", "strange", option, file, check=False)
         assert done.returncode != 0 and f"{tmp_path / 'fifo'}: expected a" in done.stderr, done.stderr
 
 

@@ -17,7 +17,7 @@ from rosafe.localization.head import Head
 from rosafe.localization.localizer import Localizer
 from rosafe.localizer_node import frame_queue, localization_loop
 from rosafe.localizer_node.frame_queue import FrameQueue
-from rosafe.localizer_node.frame_source import FrameFormat
+from rosafe.localizer_node.frame_source import _HEAD, FrameFormat
 from rosafe.localizer_node.head_rotation import FixedHead
 from rosafe.localizer_node.localization_loop import LocalizationLoop
 from rosafe.localizer_node.status import OK, NodeStatus
@@ -80,8 +80,13 @@ class Robot:
             found = features[port.kind]
             left, right = found if found.ndim == 3 else (found, None)
             message: Any = SimpleNamespace(
-                lastFrameIndex=self.index, framesOnPort=found.shape[-1], left=left, right=right, problem=""
+                data=_HEAD.pack(100, self.index, found.shape[-1]),
+                framesOnPort=found.shape[-1],
+                left=left,
+                right=right,
+                problem="",
             )
+            message.decode = lambda message=message: message
             port._receive(message)
         self.loop._attempt(self.loop._use_new_frames)
         self.loop._attempt(self.loop._publish)

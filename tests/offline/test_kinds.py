@@ -14,6 +14,7 @@ from rosafe.declarations.representation import Derived, Part, Representation
 from rosafe.dsp.framing import FramedStage, frame_parameters
 from rosafe.dsp.numeric_limits import FloatArray, clamp
 from rosafe.dsp.stage import Output
+from rosafe.interface import arguments
 from rosafe.representations import KINDS, STAGES
 from tests.dsp.bare import cut
 
@@ -80,9 +81,7 @@ def test_an_entry_for_each_part(shells: None) -> None:
 
 def test_parts_that_grow_on_the_way(shells: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Outputs are aligned at the middle of the declared axis; other parts do not change."""
-    monkeypatch.setattr(
-        "rosafe.interface.arguments._BY_NAME", {"sh_reach": Shells.REPRESENTATION.parameter("sh_reach")}
-    )
+    monkeypatch.setitem(arguments._BY_NAME, "sh_reach", Shells.REPRESENTATION.parameter("sh_reach"))
     whole = rosafe.process(SOUND, RATE, block_frames=1000, outputs=["shells"])
     got = rosafe.process(
         SOUND,

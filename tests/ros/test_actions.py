@@ -229,13 +229,13 @@ def test_a_waiting_input_is_interrupted_by_kill(graph: Graph) -> None:
 def test_genom_state_describes_all_activities(afe: Session) -> None:
     microphone = afe.build("PreProc", block=800)
     blocks = 5
-    microphone.play(noise(800 * blocks))
-    afe.read("preProc", 800 * blocks + 1)
-    state = afe.graph.message(
-        "/rosAFE/genom_state",
-        rosAFE.msg.genom_state_component,
-        accept=lambda s: s.task[1].rusage.cycles >= blocks and s.task[2].rusage.cycles >= blocks,
-    )
+    with afe.follow("preProc"):  # otherwise the blocks are combined
+        microphone.play(noise(800 * blocks))
+        state = afe.graph.message(
+            "/rosAFE/genom_state",
+            rosAFE.msg.genom_state_component,
+            accept=lambda s: s.task[1].rusage.cycles >= blocks and s.task[2].rusage.cycles >= blocks,
+        )
     assert [task.name for task in state.task] == list(ROSAFE.tasks)
     assert len(state.digest) == 32 and int(state.digest, 16) and len(state.date) < 32 and 0 < len(state.version) < 33
     by_name = {task.name: task for task in state.task}
