@@ -760,7 +760,7 @@ MUTATIONS = (
     _localizer_node(
         "localizer-muted-frames-used",
         "frame_queue.py",
-        "kept = known & ~self._mute.muted(now.middles)",
+        "kept = known & ~self._mute.muted(joined.middles[:ready])",
         "kept = known",
         "tests/localizer_node/test_frame_queue.py",
     ),

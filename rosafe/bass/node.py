@@ -28,6 +28,7 @@ from rosafe.transport.log_throttle import ThrottledLog
 from rosafe.transport.publisher import Publisher
 
 FRAMES: tuple[str, ...] = ("world", "head")  # default names of coordinate frames
+MASTER_SECONDS = 1.0  # that Acquire waits for a master that does not answer
 
 
 def _coordinate_frames() -> tuple[str, ...]:
@@ -84,8 +85,6 @@ class BassNode:
         source = self._open(activity, device, values["sampleRate"], frames_per_chunk)
         try:
             truth = self._truth_of(source, activity.stop_requested.is_set)
-            if truth is None:
-                return
             capture = Capture(source, frames_per_chunk, chunks, self._publish, self._note_loss)
             activity.interrupt_others()
             activity.raise_if_interrupted()
@@ -107,18 +106,11 @@ class BassNode:
                 self._source = None
             source.close()
 
-    def _truth_of(
-        self, source: SoundSource, give_up: Callable[[], bool]
-    ) -> contextlib.AbstractContextManager[object] | None:
-        """Return a context in which the true directions of a scene are published; None if it was given up.
-
-        Raises ComponentError for unsuitable names of coordinate frames.
-        """
+    def _truth_of(self, source: SoundSource, give_up: Callable[[], bool]) -> contextlib.AbstractContextManager[object]:
+        """Return a context in which the true directions of a scene are published; ComponentError for wrong names."""
         if not hasattr(source, "truth"):
             return contextlib.nullcontext()
-        frames = master.bounded(_coordinate_frames, FRAMES, give_up)  # the master may hang
-        if give_up():
-            return None
+        frames = master.bounded(_coordinate_frames, FRAMES, give_up, MASTER_SECONDS)
         if frames[0] == frames[1]:
             raise BASS.error("e_hwparams", f"world_frame: expected another frame than head_frame, got {frames[0]!r}")
         return TruthPublisher(cast(TruthSource, source), self._truth, self._truth_class, frames)

@@ -130,12 +130,17 @@ def check_master(uri: str, give_up: Callable[[], bool] = lambda: False) -> None:
         raise _error(uri, problem)
 
 
-def bounded(call: Callable[[], T], default: T, give_up: Callable[[], bool] = lambda: False) -> T:
-    """Return `call()`, or `default` after `RESOLVE_SECONDS`: name resolution has no other time limit."""
+def bounded(
+    call: Callable[[], T],
+    default: T,
+    give_up: Callable[[], bool] = lambda: False,
+    seconds: float = RESOLVE_SECONDS,
+) -> T:
+    """Return `call()`, or `default` after `seconds` or `give_up()`: name resolution has no other time limit."""
     results: list[T] = []
     thread = threading.Thread(target=lambda: results.append(call()), daemon=True)
     thread.start()
-    deadline = time.monotonic() + RESOLVE_SECONDS
+    deadline = time.monotonic() + seconds
     while thread.is_alive() and time.monotonic() < deadline and not give_up():
         thread.join(0.1)
     return results[0] if results else default

@@ -160,6 +160,7 @@ def go_on(world: World) -> None:
         $g load bass
         bass::Stop
         set acquire [bass::Acquire scene: &]
+        while {![dict get [bass::getAcquisition] running]} { after 10 }
         show [dict get [rosAFE::getParameters] parameters gammatone 0 name]
         show [dict get [rosAFE::gammatonePort gammatone] gammatonePort numberOfChannels] [$acquire status]
         bass::Stop

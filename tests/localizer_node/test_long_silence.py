@@ -43,6 +43,7 @@ class Robot:
         monkeypatch.setattr(rospy, "get_time", lambda: START + self.index / RATE)
         frame_clock: Any = SimpleNamespace(
             covers=lambda *_: True,
+            problem="",
             time=lambda frame: SimpleNamespace(ros=rospy.Time.from_sec(START + frame / RATE)),
         )
         publishers: Any = SimpleNamespace(begin_again=lambda: None, publish=self._publish)
