@@ -164,6 +164,21 @@ def test_a_client_computes_the_time_of_a_frame_of_any_port(afe: Session, stamped
     clock.close()
 
 
+@pytest.mark.parametrize("clock_first", [True, False])
+def test_a_clock_and_a_subscriber_in_one_process(afe: Session, stamped: Stamped, clock_first: bool) -> None:
+    """rospy uses the message class of the first one for both."""
+    clock = FrameClock() if clock_first else None
+    afe.build(block=1000)
+    with afe.graph.collect("/rosAFE/frameTime", rosAFE_frameTime) as messages:
+        clock = clock or FrameClock()
+        stamped.play(noise(3000))
+        wait_for(lambda: messages and messages[-1].frameIndex == 3000, what="the subscriber")
+        assert clock.wait()
+        wait_for(lambda: abs(clock.time(3000).wall - messages[-1].stamp.to_sec()) < 1e-5, what="the clock")
+    assert clock.problem == ""
+    clock.close()
+
+
 @pytest.fixture
 def published(graph: Graph) -> Iterator[tuple[FrameClock, Callable[..., None]]]:
     """Return a clock, and a function that publishes a time of a frame for it."""
