@@ -476,7 +476,7 @@ def test_any_changes_of_the_index(first: int) -> None:
     assert readable() == [(f, source.sample(f)) for f in range(oldest, source.index + 1)]
 
 
-# --- blocks that nobody observes ---
+# --- unobserved blocks ---
 
 
 def test_unobserved_blocks_are_read_together() -> None:
