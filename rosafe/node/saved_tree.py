@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -15,9 +16,16 @@ from rosafe.interface import RESTORED_PARAM, ROSAFE, ComponentError, Representat
 from rosafe.node.audio_input import AudioInput
 from rosafe.node.tree_state_file import TreeStateFile
 from rosafe.setups import Setup, SetupProcessor, dry_run
+from rosafe.transport import master
 from rosafe.tree.tree import Tree
 
 POLL_SECONDS = 0.1  # between two checks whether there is audio for the tree to restore
+
+
+def _announce(names: list[str]) -> None:
+    """Store the names of the processors to restore, for clients that know them, unless the master does not answer."""
+    with contextlib.suppress(*master.FAILURES):
+        rospy.set_param(f"~{RESTORED_PARAM}", [rospy.get_node_uri(), *names])
 
 
 class SavedTree:
@@ -91,7 +99,7 @@ class SavedTree:
             self.save()
         if self._pending.processors:
             names = [processor.name for processor in self._pending.processors]
-            rospy.set_param(f"~{RESTORED_PARAM}", [rospy.get_node_uri(), *names])  # for clients that know the names
+            master.bounded(lambda: _announce(names), None, finished.is_set)  # the master may hang
             self._waiting_for = f"waiting for sound on {topic or 'the Audio port'}"
             threading.Thread(target=self._restore, args=(finished,), name="restore tree", daemon=True).start()
 

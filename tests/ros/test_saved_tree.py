@@ -14,6 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
 import rospy
 from diagnostic_updater import DiagnosticStatusWrapper
 
@@ -126,8 +127,20 @@ def test_the_tree_survives_a_clean_end_but_not_stop_or_a_new_input(graph: Graph,
         rospy.delete_param(f"/{NAME}/keep")
 
 
-def test_a_tree_that_cannot_be_restored_completely_is_removed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("master", ["answers", "away", "hangs"])
+def test_a_tree_that_cannot_be_restored_completely_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, master: str
+) -> None:
     """The second processor is refused although the check before accepted it, as if the memory were used meanwhile."""
+    ended = threading.Event()
+
+    def set_param(name: str, value: object) -> None:
+        if master == "away":
+            raise ConnectionRefusedError
+        if master == "hangs":
+            ended.wait()
+
+    monkeypatch.setattr(rospy, "set_param", set_param)
     file = tmp_path / "tree.yaml"
     file.write_text("processors:\n  input: {kind: input}\n  preProc: {kind: preProc, parent: input}\n")
     begun = threading.Event()
@@ -157,6 +170,7 @@ def test_a_tree_that_cannot_be_restored_completely_is_removed(tmp_path: Path) ->
         assert [one.name for one in read(file.read_text()).processors] == ["input", "preProc"]
     finally:
         finished.set()
+        ended.set()
 
 
 def test_the_parameter_can_only_name_setups(graph: Graph, tmp_path: Path) -> None:
