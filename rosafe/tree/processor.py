@@ -160,6 +160,7 @@ class Processor(StateMachine):
             self._source_reader.start()
 
     def check_source(self) -> None:
+        """Read if its source has a block for which it did not call."""
         if self._source_reader is not None:
             self._source_reader.check()
 

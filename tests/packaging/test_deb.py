@@ -22,7 +22,7 @@ from tests.packaging.clone import environment, fresh_copy, run
 NAMES = ("python3-rosafe", "rosafe")
 DATE = "1700000000"  # seconds; the packages do not depend on the time of the build
 
-pytestmark = pytest.mark.exploration  # a clean build takes long; test_debian_folder has what needs none
+pytestmark = pytest.mark.exploration  # a clean build takes long; test_debian_folder has the tests without one
 
 
 def build(folder: Path, **variables: str) -> dict[str, Path]:

@@ -169,7 +169,7 @@ def test_the_port_and_readers_share_the_blocks() -> None:
 
 
 def test_the_port_window_is_the_same_object_until_a_frame_is_appended() -> None:
-    """Short blocks complete no frame; `derived` then holds what was computed from the window before."""
+    """Short blocks complete no frame; `derived` then still holds the results for this window."""
     signal = SignalFormat.sound(100.0)
     history = History([(2,)], signal, 0.1, port_seconds=0.3)
 
