@@ -175,8 +175,8 @@ MUTATIONS = (
     _component(
         "observed-blocks-combined",
         "audio.py",
-        "        if self.is_observed():\n            return 1\n",
-        "",
+        "return max(1, most if needed > most else math.ceil(needed))",
+        "return max(1, most)",
         "tests/ros/test_audio_ring.py -k unobserved",
     ),
     _component(

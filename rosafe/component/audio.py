@@ -318,15 +318,15 @@ class AudioReader:
         self.lag = lag
         self.awaited = 0  # number of the last frame that a request waits for
         self.ended = False
-        self.is_observed: Callable[[], bool] = lambda: True  # whether the result of each block is received
+        self.next_output: Callable[[], float] = lambda: 0  # blocks that end before this frame are not needed yet
         self.wake: Callable[[], None] = lambda: None
         self._ring = ring
 
     def combined_blocks(self) -> int:
         """Return the number of blocks to read at once."""
-        if self.is_observed():
-            return 1
-        return max(1, int(COMBINED_SECONDS * self.sample_rate / self.frames_per_block))
+        most = int(COMBINED_SECONDS * self.sample_rate / self.frames_per_block)
+        needed = (self.next_output() - self.position) / self.frames_per_block
+        return max(1, most if needed > most else math.ceil(needed))
 
     def open(self, wake: Callable[[], None]) -> None:
         """Call `wake` whenever audio has arrived."""

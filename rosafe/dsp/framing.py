@@ -205,6 +205,10 @@ class FramedStage(Stage):
     def output_count(self, count: int) -> int:
         return self._framing.complete_frames(count)
 
+    def required_input(self, frames: int) -> int:
+        buffer = self._buffer
+        return max(1, buffer.skip + len(self._framing.window) + (frames - 1) * self._framing.hop - buffer.held)
+
     @cached_property
     def output_format(self) -> SignalFormat:
         return replace(

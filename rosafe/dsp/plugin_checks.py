@@ -379,6 +379,9 @@ class CheckedStage(Stage):
         with self._locating("state_size"):
             return _whole(super().state_size(rows), "state_size")
 
+    def required_input(self, frames: int) -> int:
+        return frames  # `process` of a plugin may buffer in another way than its base class
+
     def output_count(self, count: int) -> int:
         with self._locating("output_count"):
             return _whole(super().output_count(count), "output_count")

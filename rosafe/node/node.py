@@ -134,7 +134,7 @@ class RosafeNode:
         if reader is None:
             activity.raise_if_interrupted()
             raise ROSAFE.error("e_noData", f"no audio from {self._audio.topic}: is bass acquiring?")
-        reader.is_observed = self._published.is_observed
+        reader.next_output = self._published.next_output
         try:
             with self._starting:
                 activity.raise_if_interrupted()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -82,11 +83,19 @@ class PublishedTree:
         if processor.error is not None:
             raise ComponentError("::genom::unkex", what=str(Failure.of(processor)))
 
-    def is_observed(self) -> bool:
-        """Return whether each block has an observer, or a port has a subscriber."""
-        if self._frame_time.has_subscribers:
-            return True
-        return any(processor.observers or port.has_subscribers for processor, port in tuple(self._ports.items()))
+    def next_output(self) -> float:
+        """Return an index of audio: blocks that end before it are not needed yet.
+
+        It is infinite if no port has subscribers, and 0 if each block is needed.
+        """
+        needed = 0.0 if self._frame_time.has_subscribers else math.inf
+        subscribed = []
+        for processor, port in tuple(self._ports.items()):
+            if processor.observers:
+                return 0
+            if port.has_subscribers:
+                subscribed.append(processor)
+        return min((processor.next_output() for processor in subscribed), default=needed)
 
     # --- events of the tree, on its threads ---
 

@@ -179,6 +179,9 @@ class AmsFeatures(FramedStage):
     def output_count(self, count: int) -> int:
         return self._framing.complete_frames(-(-count // self._decimation.ratio))
 
+    def required_input(self, frames: int) -> int:
+        return (super().required_input(frames) - 1) * self._decimation.ratio + 1
+
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         samples = self._decimation.process(self._as_valid_block(block))
         if self._triangles is not None:

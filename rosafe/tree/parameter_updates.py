@@ -72,6 +72,10 @@ class ParameterUpdates:
             due = self._due(number)
             return due[-1].needs if due else self._active.required_extra
 
+    def required_input(self, frames: int) -> int:
+        """Return the least number of input frames before `frames` more can be output: 1 if an update is pending."""
+        return 1 if self._queue else self._active.required_input(frames)
+
     def stage_for_block(self, block: Block) -> Stage | None:
         """Return the stage for `block` after all due updates that fit it, or None if no stage can process it."""
         stage = self._active

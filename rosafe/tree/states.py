@@ -145,6 +145,11 @@ class StateMachine:
         return self.state is REMOVED
 
     @property
+    def waits(self) -> bool:
+        """Return whether it has processed and released all blocks that it was offered."""
+        return self.state is WAIT_EXEC and self._next_block is None and not self.busy
+
+    @property
     def finished(self) -> bool:
         """Return whether no worker works on it, now or later."""
         return self.state in FINAL_STATES and not self.busy

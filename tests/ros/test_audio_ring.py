@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from dataclasses import dataclass
@@ -486,7 +487,7 @@ def test_unobserved_blocks_are_read_together() -> None:
     feed(source.message())
     reader, woken, got = opened(ring, block), [], list[int]()
     observed = False
-    reader.is_observed = lambda: observed
+    reader.next_output = lambda: 0 if observed else math.inf
     reader.open(lambda: woken.append(source.index))
 
     def play(frames: int) -> None:
@@ -528,7 +529,7 @@ def test_unobserved_blocks_are_read_when_the_sound_pauses(monkeypatch: pytest.Mo
     feed, source = ring.connect(), Source(rate=1000, window=16)
     feed(source.message())
     reader = opened(ring, 8)
-    reader.is_observed = lambda: False
+    reader.next_output = lambda: math.inf
     source.index = 12
     feed(source.message())
     assert reader.waiting
