@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import queue
 import sys
 import tempfile
 import time
@@ -95,11 +96,18 @@ class Bench:
         import rospy
         from diagnostic_msgs.msg import DiagnosticArray
 
+        received: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        subscriber = rospy.Subscriber("/diagnostics", DiagnosticArray, received.put)
         end = time.monotonic() + UP_SECONDS
-        while time.monotonic() < end:
-            for status in rospy.wait_for_message("/diagnostics", DiagnosticArray, UP_SECONDS).status:
-                if "rosAFE" in status.name and status.name.endswith("audio"):
-                    return str(status.message)
+        try:
+            while time.monotonic() < end:
+                for status in received.get(timeout=UP_SECONDS).status:  # of any node
+                    if "rosAFE" in status.name and status.name.endswith("audio"):
+                        return str(status.message)
+        except queue.Empty:
+            pass
+        finally:
+            subscriber.unregister()
         raise RuntimeError("no status of the audio on /diagnostics")
 
     def pid(self, node: str) -> int:
