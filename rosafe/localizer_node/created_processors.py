@@ -9,7 +9,8 @@ import rospy
 
 from rosafe.client.component_client import ComponentClient
 from rosafe.client.graph import Graph, NotRegisteredError
-from rosafe.interface import RESTORED_PARAM
+from rosafe.interface import RESTORED_PARAM, ComponentError
+from rosafe.transport import registration
 from rosafe.tree import tree_builder
 
 
@@ -29,6 +30,7 @@ class CreatedProcessors:
     def __init__(self) -> None:
         self.names: list[str] = []
         self.node = ""
+        self._master: int | None = None  # process id of the master that has the parameter
         self._parameter = rospy.resolve_name("~created")
 
     async def recall(self, graph: Graph, instance: str, node: str) -> None:
@@ -59,7 +61,18 @@ class CreatedProcessors:
     async def _set(self, graph: Graph, names: list[str]) -> None:
         if names != self.names:
             self.names = names
-            await graph.master("setParam", self._parameter, [self.node, *names])
+            await self._store(graph)
+
+    async def _store(self, graph: Graph) -> None:
+        master = registration.registrar().master_pid
+        await graph.master("setParam", self._parameter, [self.node, *self.names])
+        self._master = master
+
+    async def store_again(self, graph: Graph) -> None:
+        """Set the parameter if the master, which had it, has been restarted."""
+        if self.names and registration.registrar().master_pid != self._master:
+            with contextlib.suppress(ComponentError):  # it has ended again
+                await self._store(graph)
 
     async def remove(self, graph: Graph, client: ComponentClient) -> None:
         """Remove them from rosAFE, except those with children of other clients."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from rosafe.localization.head import Head
 from tests.harness import Graph, Process, private_graph, wait_for
@@ -245,6 +247,11 @@ def test_restarts_of_bass_and_rosafe(graph: Graph, device: str, sphere_model: Pa
                 assert len(names_of(graph, "hearing")) == 1, "the input cannot be removed"
 
 
+def stored_list(graph: Graph) -> str:
+    """Return the ROS parameter with rosAFE and the processors that the localizer has created; "" if there is none."""
+    return graph.run("rosparam", "get", "/localizer/created", check=False).stdout
+
+
 def test_a_master_that_is_away(tmp_path: Path, device: str, sphere_model: Path) -> None:
     with (
         private_graph(tmp_path / "home") as (graph, master),
@@ -255,6 +262,8 @@ def test_a_master_that_is_away(tmp_path: Path, device: str, sphere_model: Path) 
     ):
         graph.run("rosservice", "call", "/bass/Acquire", f"{{device: '{device}', nFramesPerChunk: 800}}")
         wait_for(lambda: any(len(line) > 1 for line in watched(seen)))
+        stored = stored_list(graph)
+        assert "ild_0" in stored
         master.kill()
         localizer.log("no answer from the ROS master")
         count = len(watched(seen))
@@ -266,7 +275,14 @@ def test_a_master_that_is_away(tmp_path: Path, device: str, sphere_model: Path) 
         count = len(watched(seen))
         wait_for(lambda: len(watched(seen)) > count + 20)
         assert any(len(line) > 1 for line in watched(seen)[-10:])
-        assert localizer.process.stop() == 0
+        wait_for(lambda: stored_list(graph) == stored)
+        localizer.process.stop(signal.SIGKILL)
+        with running_localizer(graph, "--head", str(sphere_model)) as successor:
+            successor.log("localizing with")
+            assert stored_list(graph) == stored
+            assert successor.process.stop() == 0
+        left = graph.run("rosservice", "call", "/rosAFE/getProcessors").stdout
+        assert "input_0" in left and not any(name in left for name in yaml.safe_load(stored)[1:])
 
 
 def test_recorded_sound_in_a_loop(graph: Graph, bass: Process, device: str, sphere_model: Path, tmp_path: Path) -> None:
