@@ -22,7 +22,10 @@ def test_roslaunch_localizes(tmp_path: Path, talker: Path, sphere_model: Path) -
     with graph.start("roslaunch", "rosAFE", "rosafe.launch", *arguments) as launch:
         wait_for(lambda: "localizing with" in launch.out + launch.err, what=lambda: f"the localizer: {launch}")
         with watcher(graph) as seen:
-            wait_for(lambda: any(abs(a + 50) < 10 for line in watched(seen) for a in line[1:]), what=lambda: seen.out)
+            wait_for(
+                lambda: any(abs(azimuth + 50) < 10 for line in watched(seen) for azimuth in line[1:]),
+                what=lambda: seen.out,
+            )
         assert {"/bass", "/rosAFE", "/genomixd", "/localizer"} <= graph.nodes()
         assert launch.stop(signal.SIGINT) == 0
     assert "Traceback" not in launch.out + launch.err, launch
