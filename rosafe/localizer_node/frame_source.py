@@ -251,6 +251,16 @@ class FrameSource:
         enough = new <= 0 or new >= self.least or new + self.format.block > min(port.window for port in self._ports)
         return newest > 0 and enough
 
+    def _has_time(self, index: int) -> bool:
+        return self._clock.covers(index - 1, self.format.sample_rate)
+
+    @property
+    def missing(self) -> str:
+        """The kind of message that does not arrive: sound, or the times of frames that have arrived."""
+        with self.lock:
+            newest = self._newest_block()
+            return "sound: no new frames from rosAFE" if self._has_time(newest) or not newest else self._clock.topic
+
     def take(self) -> NewFrames | None:
         """Return the frames since the last call; None if they are not enough, or their times are not known yet.
 
@@ -263,7 +273,7 @@ class FrameSource:
         """
         with self.lock:
             newest = self._newest_block()
-            if not self.is_ready() or not self._clock.covers(newest - 1, self.format.sample_rate):
+            if not self.is_ready() or not self._has_time(newest):
                 return None
             if not all(port.decode(newest) for port in self._ports):
                 return None

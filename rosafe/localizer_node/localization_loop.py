@@ -206,7 +206,7 @@ class LocalizationLoop:
         if now - self._queue.received_at <= limit:
             self._status.clear("frames")
         elif not source.problem:
-            self._status.set("frames", WARN, "waiting for sound: no new frames from rosAFE")
+            self._status.set("frames", WARN, f"waiting for {source.missing}")
 
     def _publish(self) -> bool:
         """Publish the state; return True."""

@@ -232,6 +232,23 @@ def test_rosafe_hangs_and_is_killed(graph: Graph, bass: Process, device: str, sp
         assert "Traceback" not in localizer.process.err, localizer.process.err
 
 
+def test_no_times(graph: Graph, bass: Process, device: str, sphere_model: Path) -> None:
+    """frameTime does not arrive, all other ports do: the localizer says so, and has no sources."""
+    acquire(graph, device)
+    options = ("--head", str(sphere_model), "--rosafe", "timeless")
+    with (
+        graph.node("rosAFE-ros", "-i", "timeless", "/timeless/frameTime:=/other/frameTime"),
+        running_localizer(graph, *options, name="fourth") as localizer,
+        localizer.collect() as messages,
+    ):
+        localizer.state(lambda entries: "waiting for /timeless/frameTime" in entries["message"])
+        count = len(messages)
+        wait_for(lambda: len(messages) > count + 10)
+        assert not any(message.sources for message in messages)
+        assert localizer.process.stop() == 0
+    assert "Traceback" not in localizer.process.err, localizer.process.err
+
+
 @pytest.mark.parametrize(
     ("parameter", "value", "problem"),
     [

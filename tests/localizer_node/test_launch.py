@@ -10,7 +10,11 @@ from tests.localizer_node.conftest import RATE
 from tests.localizer_node.session import watched, watcher
 
 SCENE = "sample_rate: {rate}\nsources:\n  - {{name: talker, file: {file}, loop: true, azimuth: -50}}\n"
-SETUP = "sound: {{device: 'scene:{scene}', sampleRate: 0}}\nprocessors:\n  input: {{kind: input, nFramesPerBlock: 800}}\n"
+SETUP = """
+sound: {{device: "scene:{scene}", sampleRate: 0}}
+processors:
+  input: {{kind: input, nFramesPerBlock: 800}}
+"""
 
 
 def test_roslaunch_localizes(tmp_path: Path, talker: Path, sphere_model: Path) -> None:

@@ -44,6 +44,7 @@ class Robot:
         frame_clock: Any = SimpleNamespace(
             covers=lambda *_: True,
             problem="",
+            missing="sound",
             time=lambda frame: SimpleNamespace(ros=rospy.Time.from_sec(START + frame / RATE)),
         )
         publishers: Any = SimpleNamespace(begin_again=lambda: None, publish=self._publish)
@@ -86,6 +87,7 @@ class Robot:
                 left=left,
                 right=right,
                 problem="",
+                missing="sound",
             )
             message.decode = lambda message=message: message
             port._receive(message)

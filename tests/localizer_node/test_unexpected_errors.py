@@ -82,7 +82,11 @@ class Fake:
             ),
         )
         self.source = namespace(
-            problem="", take=self.take, close=lambda: None, format=namespace(block=800, hop=1600, sample_rate=16000.0)
+            problem="",
+            missing="sound",
+            take=self.take,
+            close=lambda: None,
+            format=namespace(block=800, hop=1600, sample_rate=16000.0),
         )
         mute = namespace(active=False, muted=lambda times: np.zeros(len(times), bool))
         publishers = namespace(begin_again=lambda: None, publish=self.publish)
