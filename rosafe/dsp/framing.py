@@ -206,6 +206,10 @@ class FramedStage(Stage):
         return self._framing.complete_frames(count)
 
     def required_input(self, frames: int) -> int:
+        """Return the least number of further input frames after which `frames` more can be output.
+
+        The tree may collect short blocks until then. A smaller number than necessary is correct.
+        """
         buffer = self._buffer
         return max(1, buffer.skip + len(self._framing.window) + (frames - 1) * self._framing.hop - buffer.held)
 

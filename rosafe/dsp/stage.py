@@ -163,13 +163,6 @@ class Stage(OldNames):
         """Return the number of samples or frames of output after `count` samples or frames of input since the start."""
         return max(0, count - self.look_ahead)
 
-    def required_input(self, frames: int) -> int:
-        """Return the least number of further input frames after which `frames` more can be output.
-
-        The tree may collect short blocks until then. A smaller number than necessary is correct.
-        """
-        return frames
-
     # --- updates ----------------------------------------------------------------------------------------------
 
     def configure(self, **changes: Any) -> None:

@@ -313,8 +313,8 @@ class TreeLink:
                 raise _Waiting(f"the processor {name} of rosAFE was removed; it is requested again")
             if found[name].values != expected.values or found[name].rate != expected.rate:
                 changed = [key for key, value in expected.values.items() if found[name].values.get(key) != value]
-                what = ", ".join(changed) or "sample rate"
-                raise _Waiting(f"{what} of the processor {name} of rosAFE was changed; another one is requested")
+                what = f"{', '.join(changed) or 'sample rate'} of the processor {name} of rosAFE"
+                raise _Waiting(f"{what} was changed; another one is requested")
 
 
 def _input_of(processors: Iterable[ExistingProcessor]) -> ExistingProcessor | None:

@@ -16,7 +16,7 @@ from rosafe.node.ports import OutputPort, element
 from rosafe.node.processor_health import ProcessorHealth
 from rosafe.transport.publisher import NewestMessage, Publisher
 from rosafe.tree.block import Block
-from rosafe.tree.processor import Processor
+from rosafe.tree.processor import Processor, next_output
 from rosafe.tree.processor_registry import Failure
 from rosafe.tree.tree import Tree
 
@@ -95,7 +95,7 @@ class PublishedTree:
                 return 0
             if port.has_subscribers:
                 subscribed.append(processor)
-        return min((processor.next_output() for processor in subscribed), default=needed)
+        return min((next_output(processor) for processor in subscribed), default=needed)
 
     # --- events of the tree, on its threads ---
 

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from rosafe.dsp.framing import FramedStage
 from rosafe.dsp.plugin_checks import PluginError
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
@@ -73,8 +74,9 @@ class ParameterUpdates:
             return due[-1].needs if due else self._active.required_extra
 
     def required_input(self, frames: int) -> int:
-        """Return the least number of input frames before `frames` more can be output: 1 if an update is pending."""
-        return 1 if self._queue else self._active.required_input(frames)
+        """Return a lower limit of the number of input frames after which `frames` more can be output."""
+        stage = self._active
+        return stage.required_input(frames) if isinstance(stage, FramedStage) and not self._queue else frames
 
     def stage_for_block(self, block: Block) -> Stage | None:
         """Return the stage for `block` after all due updates that fit it, or None if no stage can process it."""

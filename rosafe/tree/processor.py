@@ -146,25 +146,6 @@ class Processor(StateMachine):
         """Whether its stage is not a plugin, which may not return."""
         return not isinstance(self.changes.final_stage, CheckedStage)
 
-    def next_output(self) -> int:
-        """Return an index of audio: blocks that end before it complete no frame of output. 0 if it is unknown.
-
-        It is known while the processor and its ancestors wait for the next block.
-        """
-        chain = [self]
-        while chain[0].parent is not None:
-            chain.insert(0, chain[0].parent)
-        root, *descendants = chain
-        processed = root.last_block
-        # Blocks move from the root down. A processor that waits after its ancestors did so has nothing left to process,
-        # unless the root has released another block.
-        if processed is None or root.state is not State.WAIT_EXEC or not all(one.waits for one in descendants):
-            return 0
-        frames = 1
-        for processor in reversed(descendants):
-            frames = processor.changes.required_input(frames)
-        return processed.next_index + frames if processed is root.last_block else 0
-
     # --- life ---
 
     def start(self) -> None:
@@ -295,3 +276,23 @@ def subtree(processor: Processor) -> Iterator[Processor]:
     for child in list(processor.children):
         yield from subtree(child)
     yield processor
+
+
+def next_output(processor: Processor) -> int:
+    """Return an index of audio: blocks that end before it complete no frame of output. 0 if it is unknown.
+
+    It is known while the processor and its ancestors wait for the next block.
+    """
+    chain = [processor]
+    while chain[0].parent is not None:
+        chain.insert(0, chain[0].parent)
+    root, *descendants = chain
+    processed = root.last_block
+    # Blocks move from the root down. A processor that waits after its ancestors did so has nothing left to process,
+    # unless the root has released another block.
+    if processed is None or root.state is not State.WAIT_EXEC or not all(one.waits for one in descendants):
+        return 0
+    frames = 1
+    for one in reversed(descendants):
+        frames = one.changes.required_input(frames)
+    return processed.next_index + frames if processed is root.last_block else 0

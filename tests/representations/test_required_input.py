@@ -1,4 +1,4 @@
-"""`Stage.required_input`: no stage outputs a frame earlier than it says, so that the tree may wait for these frames."""
+"""`FramedStage.required_input`: no stage outputs a frame earlier than it says, so that the tree may wait for these frames."""
 
 from __future__ import annotations
 
@@ -30,14 +30,16 @@ def test_no_frame_is_output_earlier(kind: str, sizes: list[int], hops: dict[str,
     sound = np.random.default_rng(1).standard_normal((2, sum(sizes)))
     for block in np.split(sound, np.cumsum(sizes)[:-1], axis=-1):
         required = {
-            kind: [stage.required_input(frames) for frames in (1, 2, 3)] for kind, stage in chain.stages.items()
+            name: [stage.required_input(frames) for frames in (1, 2, 3)]
+            for name, stage in chain.stages.items()
+            if isinstance(stage, FramedStage)
         }
         made = chain.process(block)
         for stage, output in made.items():
             parent = made.get(KINDS[stage].parent)
             arrived = (block if parent is None else parts_of(parent)[0]).shape[-1]
             frames = parts_of(output)[0].shape[-1]
-            for number, needed in enumerate(required[stage], 1):
+            for number, needed in enumerate(required.get(stage, (1, 2, 3)), 1):  # others: a frame for each one
                 assert needed >= 1
                 assert frames < number or arrived >= needed, stage
                 if stage in TIGHT:  # they output each frame as soon as its last sample has arrived

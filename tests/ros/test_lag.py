@@ -93,7 +93,7 @@ def test_the_node_reports_too_short_blocks(graph: Graph, bass_node: Process) -> 
         own.ok("InputProc", nFramesPerBlock=10)
         for request in ("PreProc", "GammatoneProc", "IhcProc", "RatemapProc", "IldProc"):
             own.ok(request)
-        with own.follow("ild"):  # without subscribers, blocks are combined
+        with own.follow("preProc"):  # each block has new samples; otherwise blocks are combined
             status = own.health(lambda entries: "keep up" in entries["message"])
         assert status["level"] == "1"
         line = wait_for(lambda: re.search(r"Audio: the tree does not keep up.*", own.process.err))
