@@ -264,7 +264,7 @@ class TreeLink:
             ) from None
 
     async def _sound_rate(self, client: ComponentClient) -> int:
-        """Return the sample rate of the sound, 0 if there is none. (rosAFE logs requests that fail for want of sound.)"""
+        """Return the sample rate of the sound, 0 if there is none: rosAFE logs requests that fail for want of it."""
         topic = self._connect or await client.port_connected("Audio") or REQUEST.parameter("connect").default
         topic = rospy.resolve_name(f"/{topic.lstrip('/')}")
         rate = await sound_rate(topic, SOUND_SECONDS)

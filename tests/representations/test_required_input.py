@@ -1,4 +1,4 @@
-"""`FramedStage.required_input`: no stage outputs a frame earlier than it says, so that the tree may wait for these frames."""
+"""`FramedStage.required_input`: no frame is output earlier, so that the tree may wait for this much input."""
 
 from __future__ import annotations
 
