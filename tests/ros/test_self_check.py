@@ -124,16 +124,22 @@ def test_the_watchdog_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
         assert systemd.watchdog_seconds() == seconds
 
 
-def test_systemd_allows_a_node_to_wait_for_a_master(private_graph: tuple[Graph, MasterProcess], tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", [("bass-ros",), ("rosafe", "localize")])
+def test_systemd_allows_a_node_to_wait_for_a_master(
+    private_graph: tuple[Graph, MasterProcess], tmp_path: Path, command: tuple[str, ...]
+) -> None:
+    """The commands of the units in systemd/: they become ready when there is a master, and then notify the watchdog."""
     graph, master = private_graph
     master.kill()
     address = str(tmp_path / "notify")
-    with listening(address) as systemd, graph.start("bass-ros", "--wait", NOTIFY_SOCKET=address) as process:
+    variables = {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "3000000"}
+    with listening(address) as systemd, graph.start(*command, "--wait", **variables) as process:
         wait_for(lambda: len(systemd.messages) > 2, 20, lambda: str(process))
         status = f"STATUS=waiting for a ROS master at {graph.uri}\nEXTEND_TIMEOUT_USEC=30000000"
         assert systemd.messages[-1][1] == status
         master.start(graph.env)
-        wait_for(lambda: systemd.messages[-1][1] == "READY=1", 30, lambda: f"{systemd.messages} {process}")
+        wait_for(lambda: systemd.count("READY=1"), 30, lambda: f"{systemd.messages} {process}")
+        wait_for(lambda: systemd.count("WATCHDOG=1") > 2, 30, lambda: f"{systemd.messages} {process}")
 
 
 def test_the_self_check_does_not_need_the_master(private_graph: tuple[Graph, MasterProcess], tmp_path: Path) -> None:
