@@ -16,7 +16,10 @@ from .chain import Chain
 RATE = 8000.0
 PARAMETERS = {"fb_nChannels": 3, "fb_highFreqHz": 3000.0}
 TIGHT = {kind for kind, stage in STAGES.items() if issubclass(stage, FramedStage)} - {"amsFeatures"}  # it decimates
-HOPS = ({}, {"ild_hSizeSec": 0.03, "rm_hSizeSec": 0.03, "cc_hSizeSec": 0.03, "rm_wSizeSec": 0.011})
+HOPS: tuple[dict[str, float], ...] = (
+    {},
+    {"ild_hSizeSec": 0.03, "rm_hSizeSec": 0.03, "cc_hSizeSec": 0.03, "rm_wSizeSec": 0.011},
+)
 
 
 @pytest.mark.parametrize("kind", STAGES)

@@ -132,8 +132,10 @@ def test_systemd_allows_a_node_to_wait_for_a_master(
     graph, master = private_graph
     master.kill()
     address = str(tmp_path / "notify")
-    variables = {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "3000000"}
-    with listening(address) as systemd, graph.start(*command, "--wait", **variables) as process:
+    with (
+        listening(address) as systemd,
+        graph.start(*command, "--wait", NOTIFY_SOCKET=address, WATCHDOG_USEC="3000000") as process,
+    ):
         wait_for(lambda: len(systemd.messages) > 2, 20, lambda: str(process))
         status = f"STATUS=waiting for a ROS master at {graph.uri}\nEXTEND_TIMEOUT_USEC=30000000"
         assert systemd.messages[-1][1] == status
