@@ -135,7 +135,8 @@ def test_a_sound_that_is_not_heard(
     graph: Graph, rosafe_node: Process, sphere_model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     graph.client()
-    monkeypatch.setattr(registration, "_registrar", SimpleNamespace(is_replaced=False))  # this is an ordinary node
+    ordinary = SimpleNamespace(is_replaced=False, master_pid=None)  # this process is a node of rospy
+    monkeypatch.setattr(registration, "_registrar", ordinary)
     monkeypatch.setattr(ear_check, "QUIET_SECONDS", 0.5)
     monkeypatch.setattr(ear_check, "WAIT_SECONDS", 1.0)
     said: list[str] = []

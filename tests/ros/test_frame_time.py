@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import urllib.request
@@ -141,9 +142,9 @@ def test_a_time_is_published_with_each_block(afe: Session, stamped: Stamped) -> 
 
 
 def test_a_client_computes_the_time_of_a_frame_of_any_port(afe: Session, stamped: Stamped) -> None:
-    clock = FrameClock()
-    with pytest.raises(LookupError, match="frameTime"):
+    with contextlib.closing(FrameClock("/absent")) as clock, pytest.raises(LookupError, match="/absent/frameTime"):
         clock.time(3)
+    clock = FrameClock()
     afe.build("PreProc", "GammatoneProc", "IhcProc", "IldProc", block=1600)  # hop of 200 frames, window of 400
     stamped.play(noise(8000))
     assert clock.wait()
