@@ -30,7 +30,7 @@ class CreatedProcessors:
     def __init__(self) -> None:
         self.names: list[str] = []
         self.node = ""
-        self._master: int | None = None  # process id of the master that has the parameter
+        self._forgotten = 0  # `times_forgotten` when the parameter was set
         self._parameter = rospy.resolve_name("~created")
 
     async def recall(self, graph: Graph, instance: str, node: str) -> None:
@@ -64,13 +64,13 @@ class CreatedProcessors:
             await self._store(graph)
 
     async def _store(self, graph: Graph) -> None:
-        master = registration.registrar().master_pid
+        forgotten = registration.registrar().times_forgotten
         await graph.master("setParam", self._parameter, [self.node, *self.names])
-        self._master = master
+        self._forgotten = forgotten
 
     async def store_again(self, graph: Graph) -> None:
         """Set the parameter if the master, which had it, has been restarted."""
-        if self.names and registration.registrar().master_pid != self._master:
+        if self.names and registration.registrar().times_forgotten != self._forgotten:
             with contextlib.suppress(ComponentError):  # it has ended again
                 await self._store(graph)
 

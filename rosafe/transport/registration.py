@@ -63,12 +63,13 @@ class Registrar(RegistrationListener):
 
     def __init__(self, manager: RegManager) -> None:
         self.changes = 0  # number of changes of the offered topics and services
-        self.master_pid: int | None = None  # None before the first call
+        self.times_forgotten = 0  # how often the master, usually restarted, did not know this node any more
         self.manager = manager
         self._name = rospy.get_name()
         self._succession: Succession = manager.handler.succession
         self._succession.on_contest = self._register_all_again
         self._master: Any = master.proxy(manager.master_uri)
+        self._pid: int | None = None  # of the master; None before the first call
         self._changed = threading.Condition()
         self._offered: dict[tuple[str, str], _Offer] = {}
         # Registrations that the master may have; only used by the thread, and before and after it.
@@ -173,6 +174,7 @@ class Registrar(RegistrationListener):
         """Register exactly `offered` at the master."""
         forgotten = not self._is_known()
         if forgotten:
+            self.times_forgotten += 1
             self._last_reported.clear()
         for entry in [e for key, e in self._last_reported.items() if offered.get(key) is not e]:
             self._call(f"unregister{_NOUNS[entry.kind]}", entry.name, self._provider(entry))
@@ -192,8 +194,8 @@ class Registrar(RegistrationListener):
         if code == 1 and self._succession.is_lost(owner, self.manager.uri):
             self.manager.handler.give_way()
             raise OSError("another node has the name")
-        same = self.master_pid in (None, pid)
-        self.master_pid = pid
+        same = self._pid in (None, pid)
+        self._pid = pid
         return same and code == 1 and owner == self.manager.uri
 
     def _call(self, method: str, *arguments: str) -> Any:
