@@ -1,13 +1,15 @@
 """Named mutations, small faults that tests must detect: `scripts/test --mutations [NAME...]`.
 
-Each is applied to a temporary copy of the tree, in which the tests named with it run. A mutation survives if they pass,
-or if they fail without it, too.
+Each is applied to a temporary copy of the tree, in which the tests named with it run; there is one copy for each core. A
+mutation survives if they pass, or if they fail without it, too.
 """
 
 from __future__ import annotations
 
 import argparse
+import concurrent.futures
 import os
+import queue
 import shutil
 import subprocess
 import sys
@@ -880,36 +882,56 @@ def first_failure(tests: str, copy: Path) -> str:
     return failed[0].split(" - ")[0].partition(" ")[2] if failed else ""
 
 
+def judge(mutation: Mutation, copies: queue.SimpleQueue[Path], unmodified: dict[str, str]) -> tuple[bool, str]:
+    """Return whether tests detect a mutation, and its row of the table.
+
+    `copies` has the copies that are not in use. `unmodified` has the first failure of tests without a mutation.
+    """
+    begin = time.monotonic()
+    copy = copies.get()
+    try:
+        result = detected_by(mutation, copy)
+        if result and mutation.tests not in unmodified:
+            unmodified[mutation.tests] = first_failure(mutation.tests, copy)
+        other = result and unmodified[mutation.tests]
+        detected = bool(result) and not other
+        if other:
+            result = f"**{other} fails without the mutation, too**"
+    except ValueError as problem:
+        detected, result = False, "**no test has run**"
+        print(problem, file=sys.stderr)
+    finally:
+        copies.put(copy)
+    seconds = time.monotonic() - begin
+    return detected, f"| {mutation.name} | {mutation.path} | {result or '**survives**'} | {seconds:.0f} |"
+
+
 def main(arguments: list[str]) -> int:
     """Apply the named mutations, or all; print a table; return 1 if one survives."""
     parser = argparse.ArgumentParser(prog="scripts/test --mutations", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help="names or their beginnings; all by default")
-    names = parser.parse_args(arguments).names
-    chosen = [m for m in MUTATIONS if not names or m.name.startswith(tuple(names))]
-    if not chosen:
-        parser.error(f"expected a beginning of one of {', '.join(m.name for m in MUTATIONS)}")
-    survivors = 0
-    unmodified: dict[str, str] = {}  # the first failure of some tests without a mutation
+    parser.add_argument(
+        "-j", "--jobs", type=int, default=os.cpu_count(), help="mutations at the same time (default: cores)"
+    )
+    options = parser.parse_args(arguments)
+    chosen = [m for m in MUTATIONS if not options.names or m.name.startswith(tuple(options.names))]
+    if not chosen or options.jobs < 1:
+        parser.error(f"expected a beginning of one of {', '.join(m.name for m in MUTATIONS)}, and at least one job")
+    detected = 0
+    unmodified: dict[str, str] = {}
+    copies: queue.SimpleQueue[Path] = queue.SimpleQueue()
     print("| mutation | file | result | s |\n|---|---|---|---|", flush=True)
-    with tempfile.TemporaryDirectory(prefix="rosafe-mutations.") as folder:
-        copy = _copy(Path(folder))
-        for mutation in chosen:
-            begin = time.monotonic()
-            try:
-                test = detected_by(mutation, copy)
-                result = test or "**survives**"
-                if test and mutation.tests not in unmodified:
-                    unmodified[mutation.tests] = first_failure(mutation.tests, copy)
-                if test and unmodified[mutation.tests]:
-                    test, result = "", f"**{unmodified[mutation.tests]} fails without the mutation, too**"
-            except ValueError as problem:
-                test, result = "", "**no test has run**"
-                print(problem, file=sys.stderr)
-            survivors += not test
-            seconds = time.monotonic() - begin
-            print(f"| {mutation.name} | {mutation.path} | {result} | {seconds:.0f} |", flush=True)
-    print(f"\n{len(chosen) - survivors} of {len(chosen)} mutations are detected")
-    return 1 if survivors else 0
+    with (
+        tempfile.TemporaryDirectory(prefix="rosafe-mutations.") as folder,
+        concurrent.futures.ThreadPoolExecutor(options.jobs) as pool,
+    ):
+        for number in range(options.jobs):
+            copies.put(_copy(Path(folder, str(number))))
+        for passed, row in pool.map(lambda mutation: judge(mutation, copies, unmodified), chosen):
+            detected += passed
+            print(row, flush=True)
+    print(f"\n{detected} of {len(chosen)} mutations are detected")
+    return 0 if detected == len(chosen) else 1
 
 
 if __name__ == "__main__":
