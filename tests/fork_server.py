@@ -73,7 +73,6 @@ def can_fork(command: Sequence[str], env: Mapping[str, str], messages: str) -> b
         and not any(":=" in argument for argument in command)  # rospy reads the command line when it is imported
         and not {"-b", "--background"} & set(command)  # such a program outlives the test process
         and env.get("PYTHONPATH", messages) == messages
-        and "COVERAGE_PROCESS_START" not in env
         and _affecting_imports(_ENV) == _affecting_imports(env)
     )
 
@@ -126,7 +125,9 @@ class ForkServer:
 
     def __init__(self) -> None:
         self._socket, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        env = {name: value for name, value in _ENV.items() if name != "PYTHONPATH"}
+        env = dict(_ENV)
+        if "COVERAGE_PROCESS_START" not in env:  # scripts/test --coverage measures from PYTHONPATH on
+            env.pop("PYTHONPATH", None)
         with other:
             self._process = subprocess.Popen(
                 ["setpriv", "--pdeathsig", "KILL", "--", PYTHON, "-m", "tests.fork_server", str(other.fileno())],
