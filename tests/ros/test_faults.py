@@ -203,7 +203,8 @@ def test_all_slots_of_a_task_are_used_and_freed(afe: Session) -> None:
     afe.ok("IldProc", name="more")
     afe.ok("Stop")
     assert afe.processors() == {}
-    assert not [t for t in afe.graph.topics() if t.startswith("/rosAFE/ildPort/")]
+    # on a busy machine, the master needs more than the second for which a request waits to remove hundreds of topics
+    wait_for(lambda: not [t for t in afe.graph.topics() if t.startswith("/rosAFE/ildPort/")])
     wait_for(lambda: threads_and_memory(afe.process.pid)[0] <= threads, what="threads end")
     assert threads_and_memory(afe.process.pid)[1] < memory + 2**26
     wait_for(lambda: open_files(afe.process.pid) < files + 50, what="files are closed with their topics")
