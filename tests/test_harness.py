@@ -48,6 +48,7 @@ def test_children_have_default_signals(way: str, tmp_path: Path) -> None:
 def test_suite_that_ignores_signals(workers: str, tmp_path: Path) -> None:
     """Run the tests above in a process that ignores signals, as under nohup or in the background of a script."""
     pytest.importorskip("xdist")
+    proc("self")  # the tests above read it
     tests = f"{PYTHON} -m pytest {workers} -p no:cacheprovider {__file__} -k default"
     command = f"trap '' HUP INT QUIT TERM USR1; exec {tests}"
     done = subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True, check=False)

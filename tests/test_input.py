@@ -25,7 +25,7 @@ from rosafe.offline.formats import FORMATS
 from rosafe.setups import Setup
 from rosafe.sound.audiofile import AudioFile, AudioFileError
 from rosafe.sound.bagsound import BagSoundError, Recording
-from tests.harness import PYTHON, SCRIPTS, Graph
+from tests.harness import PYTHON, SCRIPTS, Graph, proc
 
 ERRORS = (OSError, ValueError, AudioFileError, BagSoundError, ComponentError, CommandError)
 READERS: dict[str, Callable[[Path], object]] = {
@@ -80,6 +80,7 @@ def test_regular_files_are_read(tmp_path: Path) -> None:
 
 def test_file_replaced_while_it_is_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A FIFO replaces the file between the check and the opening."""
+    opened = proc("self", "fd")
     path = tmp_path / "file"
     path.touch()
     check = inputs._check
@@ -90,11 +91,11 @@ def test_file_replaced_while_it_is_opened(tmp_path: Path, monkeypatch: pytest.Mo
         os.mkfifo(path)
 
     monkeypatch.setattr(inputs, "_check", exchange)
-    descriptors = len(os.listdir("/dev/fd"))
+    descriptors = len(os.listdir(opened))
     with pytest.raises(OSError, match="got a FIFO") as refusal:
         open_descriptor(path)
     assert refusal.value.errno == errno.EINVAL
-    assert len(os.listdir("/dev/fd")) == descriptors
+    assert len(os.listdir(opened)) == descriptors
 
 
 def test_sound_file_opens_no_other_file(tmp_path: Path) -> None:
