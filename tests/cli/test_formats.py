@@ -41,8 +41,10 @@ def assert_same(loaded: dict[str, Any], expected: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("extension", WHOLE)
-@pytest.mark.parametrize("frames", [9000, 100])  # the second is shorter than a frame
-@pytest.mark.parametrize("channels", [[500.0], [200.0, 800.0, 2000.0]])  # a single channel also has axes
+@pytest.mark.parametrize(
+    ("frames", "channels"),
+    [(9000, [500.0]), (100, [200.0, 800.0, 2000.0])],  # a single channel also has axes; shorter than a frame
+)
 def test_all_outputs_are_loaded(tmp_path: Path, extension: str, frames: int, channels: list[float]) -> None:
     path = write(tmp_path / "sound.wav", noise(frames))
     target = tmp_path / f"result{extension}"

@@ -95,6 +95,7 @@ print(rosafe.__version__, rosafe.to_xarray(result).attrs)
 """
 
 
+@pytest.mark.exploration
 def test_type_annotations_of_a_users_script(tmp_path: Path) -> None:
     """With mypy --strict, and the package as pip installs it."""
     if not (TOOLS / "mypy").is_dir():

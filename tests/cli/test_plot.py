@@ -60,6 +60,20 @@ def test_existing_pictures_are_kept(tmp_path: Path) -> None:
     assert size(tmp_path / "sound.png")[0] > 100
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with sounds, a result, and files that are no results. No test changes it."""
+    here = tmp_path_factory.mktemp("inputs")
+    write(here / "sound.wav", noise(4000), 8000)
+    write(here / "mono.wav", noise(4000)[:1])
+    write(here / "three.wav", noise(4000)[[0, 1, 0]])
+    (here / "text.npz").write_text("no zip file")
+    np.savez(here / "other.npz", x=np.zeros(3))
+    write(here / "16k.wav", noise(4000))
+    process_file(here / "16k.wav", here / "result.npz", outputs=["ild"])
+    return here
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -84,17 +98,10 @@ def test_existing_pictures_are_kept(tmp_path: Path) -> None:
         (["result.npz", "--outputs", "itd"], ["outputs: expected outputs of the result", "got 'itd'"]),
     ],
 )
-def test_refusals(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
-    write(tmp_path / "sound.wav", noise(4000), 8000)
-    write(tmp_path / "mono.wav", noise(4000)[:1])
-    write(tmp_path / "three.wav", noise(4000)[[0, 1, 0]])
-    (tmp_path / "text.npz").write_text("no zip file")
-    np.savez(tmp_path / "other.npz", x=np.zeros(3))
-    write(tmp_path / "16k.wav", noise(4000))
-    process_file(tmp_path / "16k.wav", tmp_path / "result.npz", outputs=["ild"])
-    before = sorted(tmp_path.iterdir())
-    refused(rosafe("plot", *arguments, cwd=tmp_path), *words)
-    assert sorted(tmp_path.iterdir()) == before
+def test_refusals(folder: Path, arguments: list[str], words: list[str]) -> None:
+    before = sorted(folder.iterdir())
+    refused(rosafe("plot", *arguments, cwd=folder), *words)
+    assert sorted(folder.iterdir()) == before
 
 
 def test_wrong_command_lines() -> None:

@@ -86,13 +86,9 @@ def test_running_processes_are_kept(tmp_path: Path) -> None:
 
 
 def test_the_localizer_of_a_setup(alone: Graph, tmp_path: Path) -> None:
-    """It gets the settings of the setup, and uses its input. Another file for the head is an option."""
+    """It gets the settings of the setup, and uses its input."""
     file = tmp_path / "robot.yaml"
-    file.write_text(SETUP.partition("  preProc")[0] + "localizer: {seconds: 0.25, head_frame: ears, head: no.head}\n")
-    with alone.start("rosafe", "up", str(file), "--port", str(free_port())) as up:
-        wait_until(up, f"localizer +ended +exit code 1: .*{tmp_path}/no.head")
-        assert up.stop(signal.SIGINT) == 1
-    file.write_text(file.read_text("utf-8").replace("no.head", "sphere"))
+    file.write_text(SETUP.partition("  preProc")[0] + "localizer: {seconds: 0.25, head_frame: ears, head: sphere}\n")
     with alone.start("rosafe", "up", str(file), "--port", str(free_port())) as up:
         wait_until(up, "localizer +runs +head: sphere")
         assert {"/bass", "/rosAFE", "/localizer"} <= alone.nodes()
@@ -162,6 +158,10 @@ def test_roslaunch_starts_all_processes(alone: Graph, live: str) -> None:
     assert sorted(nodes) == sorted(
         ["/bass", "/rosAFE", "/genomixd", "/rosafe_setup", *(["/rosafe_live"] if live == "true" else [])]
     )
+
+
+def test_roslaunch_loads_the_setup(alone: Graph) -> None:
+    arguments = ("rosAFE", "rosafe.launch", "setup:=/tmp/tree.yaml", "keep:=/tmp/kept.yaml", "port:=9")
     line = alone.run("roslaunch", "--args", "/rosafe_setup", *arguments).stdout
     assert "setup load --wait 60 --keep /tmp/kept.yaml /tmp/tree.yaml __name:=rosafe_setup" in line
     assert str(SCRIPTS) in str(Path(line.split()[0]).resolve())

@@ -45,8 +45,10 @@ def sounds(folder: Path, count: int) -> tuple[list[Path], list[np.ndarray]]:
 # --- two writers --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("replace", [False, True])
-@pytest.mark.parametrize("extension", EXTENSIONS)
+@pytest.mark.parametrize(
+    ("extension", "replace"),
+    [(".npz", True), (".h5", False), (".mat", True), (".zarr", False), (".zarr", True), (".csv", False)],
+)
 def test_the_second_writer_is_refused_while_the_first_one_writes(tmp_path: Path, extension: str, replace: bool) -> None:
     (first, second), (expected, _) = sounds(tmp_path, 2)
     target = tmp_path / "out" / f"a{extension}"
@@ -56,7 +58,8 @@ def test_the_second_writer_is_refused_while_the_first_one_writes(tmp_path: Path,
     refusals = []
 
     def meanwhile(done: int, frames: int) -> None:
-        refusals.append(Other(second, target, replace).result())
+        if done in (0, frames) or not refusals:
+            refusals.append(Other(second, target, replace).result())
 
     assert process(first, target, replace, meanwhile) == "done"
     why = f"cannot write {target}: process {os.getpid()} ("
@@ -70,9 +73,8 @@ def test_many_concurrent_writers(tmp_path: Path, extension: str) -> None:
     paths, expected = sounds(tmp_path, 3)
     out = tmp_path / "out"
     out.mkdir()
-    for turn in range(4):
-        replace = turn % 2 == 1
-        target = out / (f"same{extension}" if replace else f"{turn}{extension}")
+    for replace in (False, True):
+        target = out / f"{replace}{extension}"
         others = [Other(path, target, replace) for path in paths]
         results = [other.result() for other in others]
         endings = ("done", "is writing it", "already exists; --force replaces it", "was created meanwhile")
@@ -184,7 +186,7 @@ def run(extension, progress=lambda done, frames: None):
 for extension in extensions:
     if how == "limit":
         import resource
-        for limit in (0, 1, 500, 2000, 4096, 10000, 30000, 70000, 100000, 200000, 400000, resource.RLIM_INFINITY):
+        for limit in (0, 1, 2000, 4096, 30000, 100000, 200000, resource.RLIM_INFINITY):
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
             written = run(extension)
             assert not (limit == 0 and written)
@@ -193,7 +195,7 @@ for extension in extensions:
     for at in (0.0, 0.5, 1.0):  # while the output is written
         assert not run(extension, lambda done, frames: fill() if done >= at * frames else None), (extension, at)
         os.remove(room / "filler")
-    lefts = [*range(0, 12 * 4096, 4096), 20 * 4096, 40 * 4096, 80 * 4096, 160 * 4096, 3_000_000]
+    lefts = [*(pages * 4096 for pages in (0, 1, 2, 4, 7, 11, 40, 160)), 3_000_000]
     written = []
     for left in lefts:
         fill(left)
@@ -242,4 +244,4 @@ def test_hdf5_after_a_failure_at_any_write(tmp_path: Path, name: str) -> None:
 
     count = code(np.inf)
     assert 5 < count < 90
-    assert {code(fail_at) for fail_at in range(1, count + 1)} == {100}
+    assert {code(fail_at) for fail_at in {1, 2, *range(3, count, 4), count - 1, count}} == {100}

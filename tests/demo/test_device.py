@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import soundfile
 
 from rosafe.localization import model_cache
@@ -18,14 +19,20 @@ def environment(pulse: PulseServer) -> dict[str, str]:
     return {**pulse.env, "XDG_CACHE_HOME": str(model_cache.folder().parent)}
 
 
+def noise_from_the_left(path: Path) -> Path:
+    """Write noise that lasts longer than any demonstration."""
+    noise = np.tile(0.1 * np.random.default_rng(0).normal(0, 1, 10 * 44100), round(DEMO_SECONDS / 10))
+    delayed = np.concatenate((np.zeros(16), 0.4 * noise[:-16]))
+    soundfile.write(path, np.stack((noise, delayed), axis=1), 44100, subtype="PCM_16")
+    return path
+
+
+@pytest.mark.exploration
 def test_device(pulse: PulseServer, tmp_path: Path, learn: Learn) -> None:
     """Noise from the left: the requested duration on all ports, and azimuths on the left."""
     learn(SCENE_RATE)
-    noise = np.tile(0.1 * np.random.default_rng(0).normal(0, 1, 10 * 44100), round(DEMO_SECONDS / 10))
-    delayed = np.concatenate((np.zeros(16), 0.4 * noise[:-16]))
-    soundfile.write(tmp_path / "left.wav", np.stack((noise, delayed), axis=1), 44100, subtype="PCM_16")
     with (
-        pulse.play(tmp_path / "left.wav"),
+        pulse.play(noise_from_the_left(tmp_path / "left.wav")),
         Demo("pulse", "--seconds", "3", "--out", tmp_path / "out", env=environment(pulse)) as running,
     ):
         assert running.wait(DEMO_SECONDS) == 0, running
@@ -40,12 +47,20 @@ def test_device(pulse: PulseServer, tmp_path: Path, learn: Learn) -> None:
 
 
 def test_unplugged(pulse: PulseServer, tmp_path: Path, learn: Learn) -> None:
-    """If the device is unplugged during the recording, one line reports it, and no figure is saved."""
+    """The direction is shown while noise from the left is recorded.
+
+    If the device is unplugged during the recording, one line reports it, and no figure is saved.
+    """
     learn(SCENE_RATE)
-    with Demo("pulse", "--seconds", "60", "--out", tmp_path / "out", env=environment(pulse)) as running:
-        running.wait_for_output("recording")
+    with (
+        pulse.play(noise_from_the_left(tmp_path / "left.wav")),
+        Demo("pulse", "--seconds", "600", "--out", tmp_path / "out", env=environment(pulse)) as running,
+    ):
+        running.wait_for_output(" deg left\n")
         pulse.kill()
         assert running.wait(DEMO_SECONDS) == 1
         assert running.err.startswith("demo: pulse: ") and len(running.err.splitlines()) == 1
+        assert " deg right" not in running.out
+        assert "from the beginning" not in running.out  # a device has no beginning
         running.assert_gone()
     assert not (tmp_path / "out").exists()

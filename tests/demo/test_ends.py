@@ -33,9 +33,9 @@ def sound(tmp_path: Path, learn: Learn) -> Path:
     "stage, number",
     [
         ("start", signal.SIGHUP),
-        ("start", signal.SIGINT),
         ("requests", signal.SIGTERM),
-        ("recording", signal.SIGINT),
+        pytest.param("start", signal.SIGINT, marks=pytest.mark.exploration),
+        pytest.param("recording", signal.SIGINT, marks=pytest.mark.exploration),
     ],
 )
 def test_signal(stage: str, number: signal.Signals, tmp_path: Path, sound: Path) -> None:
@@ -59,7 +59,7 @@ def test_repeated_ctrl_c_does_not_interrupt_the_clean_up(tmp_path: Path, sound: 
         running.assert_gone()
 
 
-@pytest.mark.parametrize("stage", ["start", "requests"])
+@pytest.mark.parametrize("stage", [pytest.param("start", marks=pytest.mark.exploration), "requests"])
 def test_sigkill_also_ends_the_children(stage: str, tmp_path: Path, sound: Path) -> None:
     with demo(sound, "--out", tmp_path / "out", TMPDIR=str(tmp_path)) as running:
         running.wait_for_output(STAGES[stage])
@@ -67,7 +67,10 @@ def test_sigkill_also_ends_the_children(stage: str, tmp_path: Path, sound: Path)
         running.assert_gone()
 
 
-@pytest.mark.parametrize("node, stage", [("bass-ros", "requests"), ("rosAFE-ros", "recording")])
+@pytest.mark.parametrize(
+    "node, stage",
+    [pytest.param("bass-ros", "requests", marks=pytest.mark.exploration), ("rosAFE-ros", "recording")],
+)
 def test_the_crash_of_a_node_ends_the_demo(node: str, stage: str, tmp_path: Path, sound: Path) -> None:
     with demo(sound, "--out", tmp_path / "out") as running:
         running.wait_for_output(STAGES[stage])
@@ -108,10 +111,13 @@ def test_a_failed_installation_ends_the_demo(tmp_path: Path) -> None:
         assert (running.out, running.err) == ("", "scripts/install: no network\n")
 
 
-@pytest.mark.parametrize("argument", ["-h", "--help"])
-def test_help_installs_nothing(tmp_path: Path, argument: str) -> None:
-    for script, example in (("demo", "scripts/demo speech.wav"), ("test", "scripts/test tests/genomix -k")):
-        copy = checkout_with_install(tmp_path / script, "echo installing; exit 1", script)
+def test_help_installs_nothing(tmp_path: Path) -> None:
+    for script, argument, example in (
+        ("demo", "-h", "scripts/demo speech.wav"),
+        ("demo", "--help", "scripts/demo speech.wav"),
+        ("test", "--help", "scripts/test tests/genomix -k"),
+    ):
+        copy = checkout_with_install(tmp_path / script / argument, "echo installing; exit 1", script)
         done = subprocess.run([copy, argument], check=True, capture_output=True, text=True)
         assert example in done.stdout and "installing" not in done.stdout and done.stderr == ""
     assert len(done.stdout.splitlines()) <= 15, "one screen: seven options, the folders, two examples of scripts/test"
