@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 from pathlib import Path
@@ -27,12 +28,13 @@ def finished(running: Demo) -> str:
 
 
 def test_speech_without_home(tmp_path: Path, learn: Learn) -> None:
-    """The shared speech is on the right until its end. Another ROS graph of the user has no effect.
+    """The shared speech is on the right until its end, except a rest that is shorter than a block.
 
-    Home directory, a folder for matplotlib and a terminal are not needed.
+    Another ROS graph of the user has no effect. Home directory, a folder for matplotlib and a terminal are not needed.
     """
     learn(16000)
-    speech = shared("audio", "speech_anechoic_16k.wav")
+    speech = tmp_path / "it's speech.wav"
+    shutil.copy(shared("audio", "speech_anechoic_16k.wav"), speech)
     out, cache = tmp_path / "new" / "folder", tmp_path / "cache" / "rosafe"
     cache.mkdir(parents=True)
     (cache / "matplotlib").write_text("not a folder")
@@ -48,12 +50,14 @@ def test_speech_without_home(tmp_path: Path, learn: Learn) -> None:
     ) as running:
         text = finished(running)
     check_table(text, 16000, 4000, 2.5)
+    assert "\nthe last 0.14 s are shorter than a block of 4000 frames and are omitted\n" in text
     azimuths = np.array(path(text))
     assert azimuths.shape == (len(azimuths), 2) and (azimuths[:, 1] < -15).all()
     assert re.fullmatch(r"at 2\.\d s: estimate \d\d deg right \(confidence .*\)", text.splitlines()[-1])
     check_picture(out / "rosafe-demo.png")
 
 
+@pytest.mark.exploration
 def test_telephone_quality_until_ctrl_c(tmp_path: Path, learn: Learn) -> None:
     """At 8 kHz, the highest channel is lower than in the user guide. Ctrl-C before the figure ends the demo."""
     learn(8000)

@@ -29,7 +29,7 @@ def test_the_newest_sound_since_the_start_of_the_audio_is_localized(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With an empty cache of models, which are learned from less sound than usual."""
-    monkeypatch.setattr(training, "SOUND_SECONDS", 200.0)
+    monkeypatch.setattr(training, "SOUND_SECONDS", 60.0)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     head = Head.sphere()
     lines: list[str] = []

@@ -151,7 +151,7 @@ def test_three_lines_from_a_sound_to_a_direction(
     assert len(code.splitlines()) == 3
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(training, "SOUND_SECONDS", 150.0)
+    monkeypatch.setattr(training, "SOUND_SECONDS", 60.0)
     noise = 0.1 * np.random.default_rng(1).standard_normal(RATE)
     soundfile.write("take.wav", rosafe.Head.from_sofa(head).render(noise, RATE, 40.0).T, RATE)
     exec(code, {})
