@@ -47,6 +47,17 @@ MODULES: Mapping[str, Sequence[str]] = {
     "rostopic": ("rostopic", "rospy"),
     "rosmaster": ("rosmaster", "rosmaster.main"),
 }
+_SOUNDS = ("scipy.signal", "soundfile")
+_OFFLINE = (*_SOUNDS, "rosafe.offline.files", "rosafe.offline.sounds")
+COMMANDS: Mapping[str, Sequence[str]] = {  # what commands of `rosafe` import when they run
+    "doctor": _SOUNDS,
+    "enhance": _OFFLINE,
+    "localize": _OFFLINE,
+    "plot": (*_OFFLINE, "matplotlib.figure", "matplotlib.backends.backend_agg"),
+    "process": (*_OFFLINE, "h5py", "zarr"),
+    "record": (*_SOUNDS, "rosafe.bass.recording.recorder", "rosafe.bass.sources.scene"),
+    "trace": _OFFLINE,
+}
 SCRIPTS = {name: ROOT / "scripts" / name for name in ("rosAFE-ros", "bass-ros", "genomixd", "rosafe")}
 _IMPORTS = ("PYTHON", "ROSAFE_", "COVERAGE_", "LD_", "LC_", "LANG", "ROS_NAMESPACE", "OMP_", "OPENBLAS_")
 _HARMLESS = ("PYTHONPATH", "PYTHONUNBUFFERED", "PYTHONDONTWRITEBYTECODE")  # a fork observes the first two
@@ -250,7 +261,7 @@ def _import(argv: Sequence[str]) -> None:
     name = os.path.basename(argv[0])
     modules = list(MODULES[name])
     if name == "rosafe" and len(argv) > 1 and argv[1].replace("-", "").isalnum():
-        modules.append(f"rosafe.commands.{argv[1].replace('-', '_')}")
+        modules += (f"rosafe.commands.{argv[1].replace('-', '_')}", *COMMANDS.get(argv[1], ()))
     for module in modules:
         with contextlib.suppress(ModuleNotFoundError):  # the program reports it
             importlib.import_module(module)
