@@ -13,6 +13,7 @@ import pytest
 
 from rosafe import load, process
 from rosafe.offline.corpus import find
+from rosafe.offline.files import process_file
 from tests.cli.command import (
     ROSAFE,
     SMALL,
@@ -204,7 +205,7 @@ def test_folders_whose_paths_are_too_long(tmp_path: Path) -> None:
         subprocess.run(["rm", "-rf", here, tmp_path / "out", tmp_path / "other"], check=True)
 
 
-@pytest.mark.parametrize("extension", [".npz", ".h5", ".mat", ".zarr", ".csv"])
+@pytest.mark.parametrize("extension", [".npz", ".zarr"])  # a file, and a folder
 def test_names_that_are_not_utf8(tmp_path: Path, extension: str) -> None:
     """Such files are read, written, resumed and plotted. Results contain the name as text, failed.csv as bytes."""
     here = tmp_path / "corp\udcffus"
@@ -217,18 +218,29 @@ def test_names_that_are_not_utf8(tmp_path: Path, extension: str) -> None:
     done = rosafe("process", here.name, *options, cwd=tmp_path, PYTHONIOENCODING=STRICT)
     assert done.returncode == 1 and r"corp\xffus/bad\xff.wav" in done.stderr, done
     result = tmp_path / "out\udcff" / f"s\udcfe{extension}"
+    assert_named_as_text(result, sound)
+    assert list(failed(tmp_path / "out\udcff")) == ["corp\udcffus/bad\udcff.wav"]
+    done = rosafe("process", here.name, *options, "--resume", "-v", cwd=tmp_path, PYTHONIOENCODING=STRICT)
+    assert r"s\xfe.wav -> " in done.stderr and done.stderr.count(": already complete\n") == 1, done
+    if extension == ".npz":
+        done = rosafe("plot", result, "-o", tmp_path / "p\udcff.png", PYTHONIOENCODING=STRICT)
+        assert done.returncode == 0 and not done.stderr and (tmp_path / "p\udcff.png").stat().st_size, done
+
+
+@pytest.mark.parametrize("extension", [".h5", ".mat", ".csv"])
+def test_other_formats_of_names_that_are_not_utf8(tmp_path: Path, extension: str) -> None:
+    sound = noise(3000)
+    write(tmp_path / "s.wav", sound)
+    (tmp_path / "s.wav").rename(tmp_path / "s\udcfe.wav")
+    result = tmp_path / f"s\udcfe{extension}"
+    process_file(tmp_path / "s\udcfe.wav", result, SMALL_PARAMETERS, outputs=["ild"])
+    assert_named_as_text(result, sound)
+
+
+def assert_named_as_text(result: Path, sound: np.ndarray) -> None:
     expected = process(as_int32(sound), RATE, parameters=SMALL_PARAMETERS, outputs=["ild"])
     np.testing.assert_array_equal(load(result)["ild"], expected["ild"])
     assert load(result)["source"] == r"s\xfe.wav"
-    assert list(failed(tmp_path / "out\udcff")) == ["corp\udcffus/bad\udcff.wav"]
-    if extension not in (".npz", ".zarr"):  # the others are files like .npz
-        return
-    done = rosafe("process", here.name, *options, "--resume", "-v", cwd=tmp_path, PYTHONIOENCODING=STRICT)
-    assert r"s\xfe.wav -> " in done.stderr and done.stderr.count(": already complete\n") == 1, done
-    if extension == ".zarr":
-        return
-    done = rosafe("plot", result, "-o", tmp_path / "p\udcff.png", PYTHONIOENCODING=STRICT)
-    assert done.returncode == 0 and not done.stderr and (tmp_path / "p\udcff.png").stat().st_size, done
 
 
 def test_failures_are_listed_and_the_others_are_processed(tmp_path: Path) -> None:
