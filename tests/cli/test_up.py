@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import shutil
 import signal
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
+from rosafe.commands import up
 from rosafe.transport.master import MasterError, check_master
 from tests import models
 from tests.harness import ROOT, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
@@ -51,18 +54,18 @@ def test_start_and_end_of_all_processes(alone: Graph, tmp_path: Path) -> None:
     for again in (False, True):
         port = free_port()
         command = ("rosafe", "up", str(file), "--port", str(port), "--keep", str(keep))
-        with alone.start(*command) as up:
-            wait_until(up, "Press Ctrl-C")
-            wait_until(up, f"setup +loaded +{file}: {0 if again else 2} created")
-            wait_until(up, "rosAFE +runs +2 processors")  # restored from the saved tree the second time
-            wait_until(up, "bass +runs +acquires from scene:")
-            assert f"http://127.0.0.1:{port}" in up.out
+        with alone.start(*command) as running:
+            wait_until(running, "Press Ctrl-C")
+            wait_until(running, f"setup +loaded +{file}: {0 if again else 2} created")
+            wait_until(running, "rosAFE +runs +2 processors")  # restored from the saved tree the second time
+            wait_until(running, "bass +runs +acquires from scene:")
+            assert f"http://127.0.0.1:{port}" in running.out
             assert {"/bass", "/rosAFE"} <= alone.nodes()
             if again:
-                os.kill(up.pid, signal.SIGKILL)
-                up.wait()
+                os.kill(running.pid, signal.SIGKILL)
+                running.wait()
             else:
-                assert up.stop(signal.SIGINT) == 0, up
+                assert running.stop(signal.SIGINT) == 0, running
             wait_for(lambda: not answers(alone.uri), what="the end of the master")
 
 
@@ -73,11 +76,14 @@ def test_running_processes_are_kept(tmp_path: Path) -> None:
     file.write_text(SETUP.replace("scene:", "file:/nowhere.wav"))
     try:
         master.start(graph.env)
-        with graph.node("bass-ros") as bass, graph.start("rosafe", "up", str(file), "--port", str(free_port())) as up:
-            wait_until(up, "roscore +runs .*was there")
-            wait_until(up, "bass +runs .*was there")
-            wait_until(up, "setup +refused +::bass::e_device")
-            assert up.stop(signal.SIGINT) == 1
+        with (
+            graph.node("bass-ros") as bass,
+            graph.start("rosafe", "up", str(file), "--port", str(free_port())) as running,
+        ):
+            wait_until(running, "roscore +runs .*was there")
+            wait_until(running, "bass +runs .*was there")
+            wait_until(running, "setup +refused +::bass::e_device")
+            assert running.stop(signal.SIGINT) == 1
             assert bass.alive
             assert "/rosAFE/Stop" not in graph.services()
             assert graph.run("rosservice", "call", "/bass/Stop", "{}").stdout.startswith("genom_success: True")
@@ -85,29 +91,60 @@ def test_running_processes_are_kept(tmp_path: Path) -> None:
         master.kill()
 
 
-def test_the_localizer_of_a_setup(alone: Graph, tmp_path: Path) -> None:
-    """It gets the settings of the setup, and uses its input."""
+def test_the_localizer_of_a_setup(alone: Graph, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """It gets the settings of the setup, and uses its input. The device and the file for the head are also options."""
+    head = tmp_path / "robot.head"
+    models.learn(tmp_path_factory, 44100.0).save(head)
     file = tmp_path / "robot.yaml"
-    file.write_text(SETUP.partition("  preProc")[0] + "localizer: {seconds: 0.25, head_frame: ears, head: sphere}\n")
-    with alone.start("rosafe", "up", str(file), "--port", str(free_port())) as up:
-        wait_until(up, "localizer +runs +head: sphere")
+    file.write_text(SETUP.partition("  preProc")[0] + "localizer: {seconds: 0.25, head_frame: ears, head: no.head}\n")
+    command = (
+        "rosafe",
+        "up",
+        str(file),
+        "--port",
+        str(free_port()),
+        "--device",
+        "scene:?seconds=3",
+        "--head",
+        str(head),
+    )
+    with alone.start(*command) as running:
+        wait_until(running, "localizer +runs +head: .*robot")
+        wait_until(running, r"bass +runs +acquires from scene:\?seconds=3")
+        wait_until(running, "rosAFE +runs +[2-9] processors")  # also those of the localizer
         assert {"/bass", "/rosAFE", "/localizer"} <= alone.nodes()
-        assert yaml.safe_load(alone.run("rosparam", "get", "/localizer").stdout) == {
-            "head": "sphere",
+        parameters = yaml.safe_load(alone.run("rosparam", "get", "/localizer").stdout)
+        assert {name: value for name, value in parameters.items() if name != "created"} == {
+            "head": str(head),
             "head_frame": "ears",
             "seconds": 0.25,
         }
-        assert up.stop(signal.SIGINT) == 0, up
+        assert running.stop(signal.SIGINT) == 0, running
 
 
+@pytest.mark.parametrize(
+    ("arguments", "settings"),
+    [
+        ([], None),
+        (["--localize"], {}),
+        (["--head", "robot.head"], {"head": os.path.abspath("robot.head")}),
+    ],
+)
+def test_the_localizer_without_a_setup(arguments: list[str], settings: dict[str, Any] | None) -> None:
+    parser = argparse.ArgumentParser()
+    up.configure(parser)
+    assert up._localizer_settings(parser.parse_args(arguments), None) == settings
+
+
+@pytest.mark.exploration
 def test_one_command_for_a_robot(alone: Graph, tmp_path_factory: pytest.TempPathFactory) -> None:
     models.learn(tmp_path_factory, 44100.0)
     command = ("rosafe", "up", "--device", "scene:?seconds=3", "--localize", "--port", str(free_port()))
-    with alone.start(*command, XDG_CACHE_HOME=str(models.cache(tmp_path_factory))) as up:
-        wait_until(up, "localizer +runs +head: sphere")
-        wait_until(up, r"bass +runs +acquires from scene:\?seconds=3")
-        wait_until(up, "rosAFE +runs +[1-9][0-9]* processors")  # those of the localizer
-        assert up.stop(signal.SIGINT) == 0, up
+    with alone.start(*command, XDG_CACHE_HOME=str(models.cache(tmp_path_factory))) as running:
+        wait_until(running, "localizer +runs +head: sphere")
+        wait_until(running, r"bass +runs +acquires from scene:\?seconds=3")
+        wait_until(running, "rosAFE +runs +[1-9][0-9]* processors")  # those of the localizer
+        assert running.stop(signal.SIGINT) == 0, running
 
 
 def test_a_faulty_setup_starts_no_process(alone: Graph, tmp_path: Path) -> None:
@@ -125,18 +162,20 @@ def test_a_faulty_setup_starts_no_process(alone: Graph, tmp_path: Path) -> None:
 def test_a_killed_process_is_reported(alone: Graph) -> None:
     """On a terminal, which shows one screen. The URL of the page is complete, although it is wider than the screen."""
     command = ["rosafe", "up", "--live", "--no-browser", "--port", str(free_port()), "--live-port", str(free_port())]
-    with Terminal(command, alone.env, columns=80) as up:
-        up.expect("Press Ctrl-C")
-        assert re.search(r"\?token=[\w-]{43}\r?\n", up.sent), up.sent
+    with Terminal(command, alone.env, columns=80) as running:
+        running.expect("Press Ctrl-C")
+        assert re.search(r"\?token=[\w-]{43}\r?\n", running.sent), running.sent
         done = alone.run("rosnode", "info", "/bass")
         os.kill(int(re.findall(r"Pid: (\d+)", done.stdout)[0]), signal.SIGKILL)
-        up.expect("killed by signal 9\n")
-        up.press("\x03")
-        up.expect("ending the processes")
-        assert up.end() == 1
-        *_, before, last = re.split(r"\x1b\[(?=\d+F)", up.sent)
+        running.expect("killed by signal 9\n")
+        running.press("\x03")
+        running.expect("ending the processes")
+        assert running.end() == 1
+        *_, before, last = re.split(r"\x1b\[(?=\d+F)", running.sent)
         lines = before.partition("\x1b[J")[2].replace("\r", "").replace("^C", "").splitlines()
-        assert len(lines) == 6 and f"{len(lines) + 1}F" == last.partition("\x1b")[0], up.sent  # the URL takes two lines
+        assert len(lines) == 6 and f"{len(lines) + 1}F" == last.partition("\x1b")[0], (
+            running.sent
+        )  # the URL takes two lines
 
 
 def test_roslaunch_starts_the_localizer(alone: Graph) -> None:
