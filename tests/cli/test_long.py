@@ -95,7 +95,7 @@ def begun(part: Path) -> Callable[[], bool]:
     return part.exists
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_signals(long_file: Path, number: int, code: int) -> None:
     with start("process", long_file.name, "--outputs", "ild", cwd=long_file.parent) as command:
         wait_for(begun(long_file.with_name("in.npz.part")), what=lambda: str(command))

@@ -115,12 +115,9 @@ def test_doctor(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("code", "program", "options"),
     [
-        (1, "rosafe", ["live", "--no-browser", "--port", "0", "--host", EVIL]),
         (1, "rosafe", ["setup", "save", "tree.yaml", "-i", EVIL]),
         (1, "genomixd", ["-p", "0", "--host", EVIL]),
-        (2, "genomixd", ["-p", EVIL]),
         (1, "rosAFE-ros", ["--keep", f"bad{EVIL}.yaml", "-i", "printable"]),
-        (2, "rosAFE-ros", [EVIL]),
         (1, "bass-ros", ["-i", EVIL]),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

@@ -118,6 +118,7 @@ def test_files_created_meanwhile_are_kept(tmp_path: Path) -> None:
     assert os.listdir(target) == ["precious"] and not (tmp_path / "a.zarr.part").exists()
 
 
+@pytest.mark.exploration  # test_corpus.py has two runs for one folder of files
 def test_two_runs_for_one_folder(tmp_path: Path) -> None:
     paths, expected = sounds(tmp_path, 2)
     arguments = ["process", *map(str, paths), "-o", "out/x/", "--format", "zarr", *SMALL, "--outputs=ild", "--jobs=2"]
@@ -206,10 +207,10 @@ print("ended well")
 """
 
 
-def filled(tmp_path: Path, how: str, room: Path, extension: str, before: Sequence[str] = ()) -> None:
+def filled(tmp_path: Path, how: str, room: Path, before: Sequence[str] = ()) -> None:
     source = write(tmp_path / "in.wav", noise(8000))
     done = subprocess.run(
-        [*before, PYTHON, "-c", _FILLED, str(source), str(room), how, extension],
+        [*before, PYTHON, "-c", _FILLED, str(source), str(room), how, *EXTENSIONS],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
@@ -219,18 +220,14 @@ def filled(tmp_path: Path, how: str, room: Path, extension: str, before: Sequenc
     assert done.returncode == 0 and done.stdout == "ended well\n" and done.stderr == "", done
 
 
-@pytest.mark.parametrize("extension", EXTENSIONS)
-def test_disks_that_become_full_at_any_point(
-    tmp_path: Path, small_disk: tuple[Path, list[str]], extension: str
-) -> None:
+def test_disks_that_become_full_at_any_point(tmp_path: Path, small_disk: tuple[Path, list[str]]) -> None:
     folder, before = small_disk
-    filled(tmp_path, "disk", folder, extension, before)
+    filled(tmp_path, "disk", folder, before)
 
 
-@pytest.mark.parametrize("extension", EXTENSIONS)
-def test_limited_file_size(tmp_path: Path, extension: str) -> None:
+def test_limited_file_size(tmp_path: Path) -> None:
     (tmp_path / "room").mkdir()
-    filled(tmp_path, "limit", tmp_path / "room", extension)
+    filled(tmp_path, "limit", tmp_path / "room")
 
 
 @pytest.mark.parametrize("name", ["H5Writer", "Mat73Writer"])

@@ -158,6 +158,7 @@ def test_three_lines_from_a_sound_to_a_direction(
     assert float(capsys.readouterr().out.split()[-1].rstrip("]")) == 40.0
 
 
+@pytest.mark.forks
 def test_the_tcl_example(tmp_path: Path) -> None:
     """The example runs as a script, with a genomixd on a free port."""
     (script,) = blocks("tcl")

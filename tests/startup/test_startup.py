@@ -87,7 +87,7 @@ def test_wrong_instance_name(graph: Graph, name: str) -> None:
 
 
 def test_number_of_workers(graph: Graph) -> None:
-    """The node's own parameter has priority over the environment."""
+    """The node's own parameter has priority over the environment; without it, see tests/tree/test_workers.py."""
     graph.client()
     rospy.set_param("/few/workers", 3)
     with (
@@ -96,11 +96,6 @@ def test_number_of_workers(graph: Graph) -> None:
     ):
         wait_for(lambda: ("few", "3") in reported_workers(messages), what=lambda: str(messages))
     rospy.delete_param("/few/workers")
-    with (
-        graph.node("rosAFE-ros", "-i", "few", ROSAFE_WORKERS="2"),
-        graph.collect("/diagnostics", DiagnosticArray) as messages,
-    ):
-        wait_for(lambda: ("few", "2") in reported_workers(messages), what=lambda: str(messages))
 
 
 def reported_workers(messages: list[Any]) -> set[tuple[str, str]]:
