@@ -159,6 +159,13 @@ MUTATIONS = (
         "any(part.clipped[0] for part in parts)",
         "tests/bass/test_recording.py",
     ),
+    _commands(
+        "up-localize-ignored",
+        "up.py",
+        "if of_setup is None and not options.localize and not options.head:",
+        "if of_setup is None and not options.head:",
+        "tests/cli/test_up.py -k without_a_setup",
+    ),
     # --- component
     _component(
         "audio-rate-of-ended-acquisition",
@@ -281,6 +288,20 @@ MUTATIONS = (
         "message.lastFrameIndex in (0, self._recording.index)",
         "message.lastFrameIndex == 0",
         "tests/demo/test_recorder.py",
+    ),
+    _demo(
+        "demo-sigterm-not-handled",
+        "command.py",
+        "SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)",
+        "SIGNALS = (signal.SIGINT, signal.SIGHUP)",
+        "tests/demo/test_ends.py -k test_signal -m 'not exploration'",
+    ),
+    _demo(
+        "demo-crash-of-node-not-noticed",
+        "session.py",
+        "            if child.has_ended() and not self._ending:\n",
+        "            if False:\n",
+        "tests/demo/test_ends.py -k crash -m 'not exploration'",
     ),
     # --- dsp
     _dsp(
@@ -599,6 +620,21 @@ MUTATIONS = (
         "        if parameter.name in values:\n",
         "        if False:\n",
         "tests/setups/test_files.py",
+    ),
+    # --- files and nodes
+    Mutation(
+        "output-not-locked",
+        "rosafe/output.py",
+        "            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)\n",
+        "",
+        "tests/cli/test_writers.py -k second_writer",
+    ),
+    _component(
+        "nohup-not-respected",
+        "startup.py",
+        "    nohup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN\n",
+        "    nohup = False\n",
+        "tests/startup/test_startup.py -k nohup",
     ),
     # --- sound
     _sound(
