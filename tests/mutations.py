@@ -1,7 +1,7 @@
 """Named mutations, small faults that tests must detect: `scripts/test --mutations [NAME...]`.
 
-Each is applied to a temporary copy of the tree, in which the tests named with it run; there is one copy for each core. A
-mutation survives if they pass, or if they fail without it, too.
+Each is applied to a temporary copy of the tree, in which the tests named with it run; there is one copy for each core.
+A mutation survives if they pass, or if they fail without it, too.
 """
 
 from __future__ import annotations
