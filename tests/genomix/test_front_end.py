@@ -33,7 +33,7 @@ def test_at_a_shell(world: World, tmp_path: Path) -> None:
     def frames(kind: str, name: str) -> int:
         return int(world.http.call(f"rosAFE/{kind}Port/{name}")[f"{kind}Port"]["lastFrameIndex"])
 
-    run("rosservice", "call", "/bass/Acquire", "{device: 'scene:'}")
+    run("rosservice", "call", "/bass/Acquire", "{device: 'scene:', sampleRate: 8000}")
     for kind, chain in CHAINS.items():
         lines = [line.split() for line in run("rosafe", "request", kind).splitlines()]
         assert [words[1] for words in lines][1:] == chain
@@ -45,7 +45,7 @@ def test_at_a_shell(world: World, tmp_path: Path) -> None:
     assert "genom_success: True" in run("rosservice", "call", "/rosAFE/modifyParameter", change)
     assert 'name: "pi_confThres"\n        value: "0.5"' in run("rosservice", "call", "/rosAFE/getProcessors")
     sound = str(tmp_path / "take.wav")
-    run("rosafe", "record", sound, "--device", "scene:", "--seconds", "1", "--quiet")
+    run("rosafe", "record", sound, "--device", "scene:", "--rate", "8000", "--seconds", "0.5", "--quiet")
     run("rosafe", "plot", sound, "-o", str(tmp_path / "take.png"), "--outputs", "pitch,amsFeatures")
     picture(tmp_path / "take.png")
 
@@ -54,7 +54,7 @@ def test_in_eltclsh(world: World) -> None:
     script = """
         set g [::genomix::connect $address]
         $g load bass; $g load rosAFE
-        ::bass::Acquire scene:
+        ::bass::Acquire {device scene: sampleRate 16000}
         show {*}[dict values [dict get [::rosAFE::request pitch] dependencies]]
         show [dict get [::rosAFE::request amsFeatures {ams_nFilters 9}] name]
         while 1 {
@@ -78,10 +78,10 @@ def test_in_eltclsh(world: World) -> None:
 
 
 def test_in_python(tmp_path: Path) -> None:
-    sound, wanted = Scene(16000).frames(16000), ["pitch", "amsFeatures"]
-    result = rosafe.process(sound, 16000, block_frames=8000, outputs=wanted)
+    sound, wanted = Scene(16000).frames(8000), ["pitch", "amsFeatures"]
+    result = rosafe.process(sound, 16000, block_frames=4000, outputs=wanted)
     change = [(1, "pi_confThres", 0.9)]
-    changed = rosafe.process(sound, 16000, block_frames=8000, outputs=wanted, modifications=change)
+    changed = rosafe.process(sound, 16000, block_frames=4000, outputs=wanted, modifications=change)
     voiced, less = (np.isfinite(one["pitch"][:, 0]).sum() for one in (result, changed))
     assert 0 < less < voiced
     assert result["pitch"].shape[:2] == (2, 3) and result["amsFeatures"].ndim == 4

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from tests.genomix.world import HttpError, World
-from tests.harness import wait_for
+from tests.harness import Process, wait_for
 from tests.matlab import octave
 
 INPUT = """
     set g [genomix::connect $address]
     $g load bass; $g load rosAFE
-    bass::Acquire scene:
+    bass::Acquire scene: 16000
     rosAFE::connect_port Audio bass/Audio
     rosAFE::InputProc
 """
@@ -23,7 +24,7 @@ MISSPELT = "ihc: ihc_method: unknown word 'bernstien'; dau is used; the most sim
 
 
 def start(world: World, *processors: str) -> None:
-    world.http.call("bass/Acquire", ["scene:"])
+    world.http.call("bass/Acquire", ["scene:", 16000])
     world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
     world.http.call("rosAFE/InputProc")
     for request in processors:
@@ -127,27 +128,45 @@ def test_zeros_of_tcl(world: World) -> None:
 # --- unknown words ----------------------------------------------------------------------------------------------
 
 
-# Prints the tree's entry in /diagnostics once its message contains a text, or does not.
+# Prints the tree's entries in /diagnostics: level, message and unknown words.
 DIAGNOSED = """
-import sys, json, rospy
+import json, rospy
 from diagnostic_msgs.msg import DiagnosticArray
-rospy.init_node("reader", anonymous=True)
-while True:
-    for status in rospy.wait_for_message("/diagnostics", DiagnosticArray, 60).status:
-        if status.name.endswith("processors") and (sys.argv[1] in status.message) == (sys.argv[2] == "in"):
+def show(message):
+    for status in message.status:
+        if status.name.endswith("processors"):
             level = status.level if isinstance(status.level, int) else status.level[0]
-            print(json.dumps([level, status.message, [v.value for v in status.values if v.key == "unknown word"]]))
-            sys.exit()
+            words = [v.value for v in status.values if v.key == "unknown word"]
+            print(json.dumps([level, status.message, words]), flush=True)
+rospy.init_node("reader", anonymous=True)
+rospy.Subscriber("/diagnostics", DiagnosticArray, show)
+rospy.spin()
 """
 
 
-def diagnosed(world: World, text: str, there: bool = True) -> list[Any]:
+def diagnosed(reader: Process, text: str, there: bool = True) -> list[Any]:
     """Wait until `text` is (or is not) in the message; return level, message and unknown words of the tree's health."""
-    done = world.graph.run("python3", "-c", DIAGNOSED, text, "in" if there else "out", timeout=90)
-    return list(json.loads(done.stdout))
+    first = len(_complete_lines(reader))
+
+    def found() -> list[Any]:
+        entries: list[list[Any]] = [json.loads(line) for line in _complete_lines(reader)[first:]]
+        return next((entry for entry in entries if (text in entry[1]) == there), [])
+
+    return wait_for(found, what=lambda: repr(reader))
 
 
-def test_a_misspelt_choice_causes_a_warning(world: World) -> None:
+def _complete_lines(reader: Process) -> list[str]:
+    return reader.out.rpartition("\n")[0].splitlines()
+
+
+@pytest.fixture
+def reader(world: World) -> Iterator[Process]:
+    """A program that prints the diagnostics of the tree."""
+    with world.graph.start("python3", "-c", DIAGNOSED) as process:
+        yield process
+
+
+def test_a_misspelt_choice_causes_a_warning(world: World, reader: Process) -> None:
     start(world, "PreProc", "GammatoneProc")
     assert world.http.call("rosAFE/IhcProc", {"ihc_method": "bernstien"}) == {"warning": MISSPELT}
     assert reported_parameters(world, "ihc", "ihc")["ihc_method"] == "dau"
@@ -156,7 +175,7 @@ def test_a_misspelt_choice_causes_a_warning(world: World) -> None:
     wanted = MISSPELT.replace("ihc:", "two:", 1).replace("bernstien", "Bernstein")
     wait_for(lambda: world.http.status(number).get("warning") == wanted, what=lambda: str(world.http.status(number)))
     assert world.http.status(number) == {"id": number, "status": "sent", "warning": wanted}
-    assert diagnosed(world, "more unknown") == [1, f"{MISSPELT} (and 1 more unknown words)", [MISSPELT, wanted]]
+    assert diagnosed(reader, "more unknown") == [1, f"{MISSPELT} (and 1 more unknown words)", [MISSPELT, wanted]]
     change = {"nameProc": "two", "nameParam": "ihc_method", "newValue": "halfwav"}
     changed_parameters = "two: ihc_method: unknown word 'halfwav'; dau is used; the most similar known word is halfwave"
     assert world.http.call("rosAFE/modifyParameter", change) == {"warning": changed_parameters}
@@ -164,9 +183,9 @@ def test_a_misspelt_choice_causes_a_warning(world: World) -> None:
     assert world.http.wait(number, "done")["warning"] == changed_parameters
     # corrected values and removed processors cause no further warnings
     world.http.call("rosAFE/modifyParameter", {**change, "newValue": "halfwave"})
-    assert diagnosed(world, "more unknown", there=False) == [1, MISSPELT, [MISSPELT]]
+    assert diagnosed(reader, "more unknown", there=False) == [1, MISSPELT, [MISSPELT]]
     world.http.call("rosAFE/removeProcessor", ["ihc"])
-    assert diagnosed(world, MISSPELT, there=False) == [0, "4 processors", []]
+    assert diagnosed(reader, MISSPELT, there=False) == [0, "4 processors", []]
 
 
 def test_known_choices_and_accepted_misspellings_cause_no_warning(world: World) -> None:
@@ -242,7 +261,7 @@ def test_strict_mode_rejects_unknown_choices(world: World, by: str) -> None:
     options = ("--strict",) if by == "option" else ("_strict_words:=true",)
     with world.graph.node("rosAFE-ros", "-i", name, *options):
         call = world.http.call
-        call("bass/Acquire", ["scene:"])
+        call("bass/Acquire", ["scene:", 16000])
         call(f"{name}/connect_port", ["Audio", "bass/Audio"])
         for request in ("InputProc", "PreProc", "GammatoneProc", "IhcProc"):
             assert call(f"{name}/{request}") == {}

@@ -139,6 +139,23 @@ def test_tcl(robot: World) -> None:
     assert "::genom::serialization" in lines[5] and "::arm::FAST" in lines[5]
 
 
+# Describes the component arm with each of some folders first in the path, and prints the error.
+DESCRIBE = """
+import os, sys
+from rosafe.client import installed_components
+from rosafe.interface import ComponentError
+for folder in sys.argv[1:]:
+    if os.fork() == 0:
+        sys.path.insert(0, folder)
+        try:
+            installed_components.describe("arm")
+        except ComponentError as problem:
+            print(problem.ex, problem.detail["what"])
+        sys.exit()
+    os.wait()
+"""
+
+
 def test_the_error_names_a_missing_package(robot: World, tmp_path: Path) -> None:
     """The package, a message that the package needs, or the state that every component has."""
     empty = tmp_path / "empty"
@@ -153,23 +170,22 @@ def test_the_error_names_a_missing_package(robot: World, tmp_path: Path) -> None
         for name in ("__init__", "_kill"):
             (foreign / "arm" / part / f"{name}.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')\n")
     ours = robot.graph.env["PYTHONPATH"].partition(":")[2]
-    for folder, words in (
-        (empty, ["ROS package arm is not installed", "PYTHONPATH"]),
-        (broken, ["arm.msg", "_arm_point"]),
-        (old, ["genom_state_component"]),
-        (closed, ["connect_port"]),
-        (foreign, ["ROS package arm is not installed", "genpy"]),
-    ):
-        path = robot.graph.env["PYTHONPATH"]
-        robot.graph.env["PYTHONPATH"] = f"{folder}:{ours}"
-        try:
-            with worlds.genomixd(robot.graph) as (_, port), pytest.raises(HttpError) as raised:
-                Http(port).get("/load/arm")
-        finally:
-            robot.graph.env["PYTHONPATH"] = path
-        assert raised.value.ex == "::genomix::e_load"
-        for word in words:
-            assert word in raised.value.what
+    expected = {
+        empty: ["ROS package arm is not installed", "PYTHONPATH"],
+        broken: ["arm.msg", "_arm_point"],
+        old: ["genom_state_component"],
+        closed: ["connect_port"],
+        foreign: ["ROS package arm is not installed", "genpy"],
+    }
+    command = (harness.PYTHON, "-c", DESCRIBE, *map(str, expected))
+    lines = robot.graph.run(*command, PYTHONPATH=f"{harness.ROOT}:{ours}").stdout.splitlines()
+    for line, words in zip(lines, expected.values(), strict=True):
+        assert line.startswith("::genomix::e_load ") and all(word in line for word in words), line
+    home = harness.Graph(robot.graph.uri, tmp_path)
+    home.env["PYTHONPATH"] = f"{foreign}:{ours}"
+    with worlds.genomixd(home) as (_, port), pytest.raises(HttpError) as raised:
+        Http(port).get("/load/arm")
+    assert raised.value.ex == "::genomix::e_load" and "genpy" in raised.value.what
     assert not (tmp_path / "imported").exists()
 
 

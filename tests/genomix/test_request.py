@@ -18,13 +18,14 @@ from tests.genomix.world import HttpError, World
 
 pytestmark = pytest.mark.ros
 
+RATE = 16000
 CHAIN = ["input_0", "time_0", "filterbank_0", "innerhaircell_0", "ild_0"]
 
 
 @pytest.fixture
 def sound(world: World) -> Iterator[World]:
     """The module's world, in which bass captures and rosAFE is idle."""
-    world.http.call("bass/Acquire", {"device": "scene:"})
+    world.http.call("bass/Acquire", {"device": "scene:", "sampleRate": RATE})
     yield world
 
 
@@ -64,7 +65,7 @@ def command(world: World, *arguments: str) -> tuple[int, str, str]:
 def test_the_tree_and_its_numbers(sound: World) -> None:
     """The port has the output of `rosafe.process` for the same input and parameters."""
     requested = {"fb_nChannels": 5, "ild_wSizeSec": 0.04, "ild_hSizeSec": 0.02, "ihc_method": "halfwave"}
-    response = sound.http.call("rosAFE/request", {"representation": "ild", **requested, "nFramesPerBlock": 8820})
+    response = sound.http.call("rosAFE/request", {"representation": "ild", **requested, "nFramesPerBlock": RATE // 5})
     assert response == {
         "name": "ild_0",
         "dependencies": CHAIN,
@@ -83,11 +84,11 @@ def test_the_tree_and_its_numbers(sound: World) -> None:
         return dict(sound.http.call("rosAFE/inputProcPort")["inputProcPort"])
 
     start = heard()["lastFrameIndex"]
-    harness.wait_for(lambda: heard()["lastFrameIndex"] >= start + 2 * 44100)  # no zeros, nor filters at their start
+    harness.wait_for(lambda: heard()["lastFrameIndex"] >= start + 2 * RATE)  # no zeros, nor filters at their start
     sound.http.call("bass/Stop")
     ild = harness.wait_for(lambda: _settled(sound, "inputProcPort", "ildPort/ild_0"))
     ears = np.array([heard()[ear]["data"] for ear in ("left", "right")])
-    expected = rosafe.process(ears, 44100, parameters=requested, outputs=["ild"])["ild"][:, -25:]
+    expected = rosafe.process(ears, RATE, parameters=requested, outputs=["ild"])["ild"][:, -25:]
     found = np.array([channel["data"] for channel in ild["left"]["dataN"]])[:, -25:]
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
     assert np.ptp(found) > 1
@@ -254,7 +255,7 @@ def test_tcl(sound: World) -> None:
 
 def test_the_command(sound: World) -> None:
     world = sound
-    code, out, err = command(world, "ild", "fb_nChannels=16", "--connect", "bass/Audio", "nFramesPerBlock=4410")
+    code, out, err = command(world, "ild", "fb_nChannels=16", "--connect", "bass/Audio", "nFramesPerBlock=1600")
     assert (code, err) == (0, "")
     ports = ["inputProcPort", "preProcPort/time_0", "gammatonePort/filterbank_0", "ihcPort/innerhaircell_0"]
     shown = [f"created  {name:15}  /rosAFE/{port}" for name, port in zip(CHAIN, [*ports, "ildPort/ild_0"], strict=True)]

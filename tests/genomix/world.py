@@ -159,6 +159,20 @@ def genomixd(graph: harness.Graph, *arguments: str) -> Iterator[tuple[harness.Pr
 
 
 @contextmanager
+def changed_genomixd(world: World, changes: str) -> Iterator[World]:
+    """A second genomixd of a world, whose constants the Python code `changes` changes."""
+    code = f"import sys; sys.path.insert(0, {str(harness.ROOT)!r})\n{textwrap.dedent(changes)}\n{_MAIN}"
+    with world.graph.start(harness.PYTHON, "-c", code) as server:
+        yield World(world.graph, world.master, server, port_of(server))
+
+
+_MAIN = """
+from rosafe.genomix import daemon
+sys.exit(daemon.main(["-v", "-p", "0", *sys.argv[1:]]))
+"""
+
+
+@contextmanager
 def world(home: Path, nodes: bool = True) -> Iterator[World]:
     """A new graph with genomixd and, by default, bass-ros and rosAFE-ros."""
     with harness.private_graph(home) as (graph, master), genomixd(graph) as (server, port):
