@@ -212,14 +212,14 @@ def test_plots_scroll_until_they_are_frozen(shown: Browser) -> None:
     first = shown.run(look)
     shown.until(f"return arguments[0] !== ({look.removeprefix('return ')})", first)
     shown.press("#freeze")
-    # Nothing moves during the next 30 animation frames.
+    # Nothing moves during the next five animation frames, which are half a second.
     still = """
     const done = arguments[arguments.length - 1];
     const canvas = document.querySelector('canvas[data-kind=ild]');
     const head = () => JSON.parse(canvas.dataset.plot).to;
     requestAnimationFrame(() => requestAnimationFrame(() => {
       const before = head();
-      let left = 30;
+      let left = 5;
       const step = () => (left -= 1) ? requestAnimationFrame(step) : done(head() - before);
       step();
     }));
@@ -288,7 +288,7 @@ def test_the_limit_of_open_plots_is_reported(world: World, shown: Browser) -> No
     shown.until(f"{count} >= arguments[0]", len(names) + 8)
     shown.run("for (const one of document.querySelectorAll('.node .eye[aria-pressed=false]')) one.click()")
     last = "const [panel] = [...document.querySelectorAll('.panel canvas')].slice(-1); "
-    shown.until(last + "return panel.title.includes('close another')")
+    shown.until(last + "panel.scrollIntoView(); return panel.title.includes('close another')")
     opened = "[...document.querySelectorAll('.node .eye[aria-pressed=true]')]"
     shown.run(f"for (const one of {opened}.slice(0, 12)) one.click()")
     shown.until(last + "panel.scrollIntoView(); return panel.title === '' && Boolean(panel.dataset.plot)")
