@@ -20,8 +20,8 @@ from tests.matlab import octave
 
 pytestmark = pytest.mark.ros
 
-RATE = 16000
-DELAY = 5  # of the right ear, samples
+RATE = 8000
+DELAY = 3  # of the right ear, samples
 PITCH = 200.0  # Hz
 
 
@@ -63,10 +63,10 @@ def begin(sound: Path, port: float = 0.2) -> str:
         client = genomix.client;
         bass = client.load('bass');
         rosAFE = client.load('rosAFE');
-        dObj = dataObject_RosAFE(bass, rosAFE, 'file:{sound}?loop=1', {RATE}, 1600, 1, {port}, 3, 3);
+        dObj = dataObject_RosAFE(bass, rosAFE, 'file:{sound}?loop=1', {RATE}, {RATE // 10}, 1, {port}, 3, 3);
         mObj = manager_RosAFE(dObj);
-        below = genParStruct('fb_highFreqHz', 4000);
-        par = genParStruct('fb_nChannels', 4, 'fb_highFreqHz', 4000);
+        below = genParStruct('fb_highFreqHz', 3000);
+        par = genParStruct('fb_nChannels', 4, 'fb_highFreqHz', 3000);
     """
 
 
@@ -92,7 +92,7 @@ def test_all_representations_are_equal_to_their_ports(world: World, sound: Path)
                 cellfun(@(signal) signal.Channel, sOut, 'UniformOutput', false), ...
                 cellfun(@(signal) signal.Name, sOut, 'UniformOutput', false)});
         end
-        for word = words
+        for word = words(1:7:end)
             mObj.addProcessor(word{1}, par);
         end
         show('counts', structfun(@numel, mObj.Processors)); % there are no duplicates
@@ -154,7 +154,7 @@ def test_all_representations_are_equal_to_their_ports(world: World, sound: Path)
     assert results["zeroCrossings"][1:] == [4]
     assert results["fList"][0] == ["pitch", "rawPitch", "confidence"]
     assert len(results["fList"][1]) == 14 and results["fList"][1][:2] == ["centroid", "crest"]
-    assert results["alike"] and results["lags"] == [1 / RATE, -18 / RATE]
+    assert results["alike"] and results["lags"] == [1 / RATE, -9 / RATE]
     assert all(results["figures"])
     assert results["clean"] == [1] + [0] * len(kinds)
 
@@ -203,23 +203,23 @@ def test_pitch_and_time_differences_of_a_tone_and_of_silence(world: World, sound
 SCRIPT = """
     p = mObj.addProcessor('onsetStrength', par);
     parameters = genParStruct('sf_br_cf', 1000, 'sf_ro_perc', 0.9, 'sf_requests', {'flux', 'centroid'}, ...
-        'fb_highFreqHz', 4000);
+        'fb_highFreqHz', 3000);
     p = mObj.addProcessor('spectralFeatures', parameters);
     show('features', p{1}.fList);
     one = mObj.Processors.spectralFeatures{1};
     show('aliases', {one.sf_brCF, one.sf_roPerc, one.sf_requests});
-    breebaart = genParStruct('fb_highFreqHz', 4000, 'adpt_model', 'adt_breebart');
+    breebaart = genParStruct('fb_highFreqHz', 3000, 'adpt_model', 'adt_breebart');
     p = mObj.addProcessor('adaptation', breebaart);
     show('model', mObj.Processors.adaptation{1}.adpt_model);
     show('has', cellfun(@isstruct, {mObj.hasProcessor('spectralFeaturesProc', parameters), ...
         mObj.hasProcessor('spectralFeatures', below), mObj.hasProcessor('adaptationProc', breebaart), ...
-        mObj.hasProcessor('adaptation', genParStruct('fb_highFreqHz', 4000, 'adpt_model', 'adt_puschel')), ...
+        mObj.hasProcessor('adaptation', genParStruct('fb_highFreqHz', 3000, 'adpt_model', 'adt_puschel')), ...
         mObj.hasProcessor('onsetProc', par), mObj.hasProcessor('onsetProc', below)}));
-    range = genParStruct('fb_highFreqHz', 4000, 'p_pitchRangeHz', [100 300]);
+    range = genParStruct('fb_highFreqHz', 3000, 'p_pitchRangeHz', [100 300]);
     p = mObj.addProcessor({'pitch', 'ic'}, {range, par});
     show('range', mObj.Processors.pitch{1}.pi_rangeHz);
-    p = mObj.addProcessor('pitch', genParStruct('fb_highFreqHz', 4000, 'pi_rangeHz', [100 300]));
-    modulations = genParStruct('fb_nChannels', 4, 'fb_highFreqHz', 4000, 'ams_nFilter', 3, 'ams_lowFreqHz', 8);
+    p = mObj.addProcessor('pitch', genParStruct('fb_highFreqHz', 3000, 'pi_rangeHz', [100 300]));
+    modulations = genParStruct('fb_nChannels', 4, 'fb_highFreqHz', 3000, 'ams_nFilter', 3, 'ams_lowFreqHz', 8);
     p = mObj.addProcessor('amsFeatures', modulations);
     filters = cell2mat(mObj.Processors.amsFeatures{1}.ams_cfHz);
     show('modulations', {p{2}.cfHz, p{2}.modCfHz, isequal(p{2}.modCfHz, filters)});

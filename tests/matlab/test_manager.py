@@ -17,8 +17,8 @@ BEGIN = """
     client = genomix.client;
     bass = client.load('bass');
     rosAFE = client.load('rosAFE');
-    dObj = dataObject_RosAFE( bass, rosAFE, 'scene:', 16000, 1600, 1, 0.5, 3, 2 );
-    par = genParStruct('fb_nChannels', 4, 'fb_highFreqHz', 4000);
+    dObj = dataObject_RosAFE( bass, rosAFE, 'scene:', 8000, 800, 1, 0.5, 3, 2 );
+    par = genParStruct('fb_nChannels', 4, 'fb_highFreqHz', 3000);
 """
 
 
@@ -69,8 +69,8 @@ def test_representations_and_their_data(world: World) -> None:
         port = rosAFE.crossCorrelationPort('-m', 'crosscorrelation_0').crossCorrelationPort;
         data = dObj.crosscorrelation{1}.Data;
         show('cc', isequal(data(end-9:end, :, :), port.left(end-9:end, :, :)));
-        seconds = [size(dObj.time{1}.Data, 1) / 16000, size(dObj.filterbank{2}.Data, 1) / 16000, ...
-            size(dObj.innerhaircell{1}.Data, 1) / 16000, size(dObj.ild{1}.Data, 1) / 100];
+        seconds = [size(dObj.time{1}.Data, 1) / 8000, size(dObj.filterbank{2}.Data, 1) / 8000, ...
+            size(dObj.innerhaircell{1}.Data, 1) / 8000, size(dObj.ild{1}.Data, 1) / 100];
         show('seconds', seconds);
         show('rates', [dObj.time{1}.FsHz, dObj.ild{1}.FsHz, dObj.ratemap{1}.FsHz]);
         mObj.processChunk();
@@ -82,7 +82,7 @@ def test_representations_and_their_data(world: World) -> None:
         """,
     )
     assert results["before"] == [[], 0]
-    assert results["signals"] == ["ild_0", [1, 2], "right", "crosscorrelation_0", 37]
+    assert results["signals"] == ["ild_0", [1, 2], "right", "crosscorrelation_0", 19]
     assert results["cfHz"]
     assert results["names"] == [
         "input_0",
@@ -95,12 +95,12 @@ def test_representations_and_their_data(world: World) -> None:
     ]
     assert results["counts"] == [1] * 7 + [0] * (results["kinds"] - 7)
     assert results["acquire"] == "sent"
-    assert results["input"] == [8000, True, True] or results["input"] == [8000, 1, 1]
+    assert results["input"] == [4000, True, True] or results["input"] == [4000, 1, 1]
     assert results["ratemap"] and results["cc"]
     *samples, frames = results["seconds"]
     assert min(samples) >= 0.6 and max(samples) - min(samples) <= 0.5
     assert abs(frames - samples[2]) <= 0.5
-    assert results["rates"] == [16000, 100, 100]
+    assert results["rates"] == [8000, 100, 100]
     assert results["nothing new"] and results["cleared"][1] is False and results["reset"]
     assert 0 in results["cleared"][0]
 
@@ -202,5 +202,5 @@ def test_reuse_changes_and_errors(world: World) -> None:
     assert results["name"] not in left
     assert results["middle"] == 2
     assert results["root"][0] == [1, 1, 2, 0] and results["root"][1] == 0
-    assert results["follow"] == [50, [500, 1000], 17, [2, 17], True]
+    assert results["follow"] == [50, [500, 1000], 9, [2, 9], True]
     assert results["clean"] == [[0, 0, 0, 0], "input_0", 0, 1]

@@ -55,7 +55,7 @@ CLIENT = """
     mObj = manager_RosAFE(dObj);
     mObj.addProcessor('ild');
     mObj.addProcessor('ratemap');
-    mObj.addProcessor('pitch');
+    mObj.addProcessor('pitch', genParStruct('fb_nChannels', 4));
     mObj.addProcessor('crosscorrelation', genParStruct('fb_nChannels', 4));
     mObj.addProcessor('amsFeatures', genParStruct('fb_nChannels', 4));
     mObj.modifyParameter( 'time_0', 'pp_bRemoveDC', '0' );

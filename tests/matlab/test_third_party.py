@@ -24,8 +24,8 @@ ROBOT = """
     end
     client = genomix.client;
     bass = client.load('bass');
-    bass.Acquire('-a', 'scene:', 44100, 2205, 20);
-    while bass.Audio().Audio.lastFrameIndex < 44100
+    bass.Acquire('-a', 'scene:', 16000, 800, 20);
+    while bass.Audio().Audio.lastFrameIndex < 16000
         pause(0.05);
     end
     bass.Stop();
@@ -50,10 +50,10 @@ ROBOT = """
 
 def test_a_robot_interface(world: World) -> None:
     results = octave.run_and_parse(world, ROBOT)
-    assert results["sizes"] == [[1, 44100], [22050, 2], 0.5, [44100, 2]]
+    assert results["sizes"] == [[1, 16000], [8000, 2], 0.5, [16000, 2]]
     assert all(results["same"]) and results["alive"]
     assert results["types"] == ["cell", "double"]
-    assert results["old"] == [[44100, 1], [44100, 2]]
+    assert results["old"] == [[16000, 1], [16000, 2]]
     assert results["fields"] == [[0, 1], "done"]
     assert results["wrong"] == "genomix:connection expected at most '-columns' after the address of genomixd"
 
