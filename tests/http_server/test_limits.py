@@ -138,11 +138,26 @@ ATTACKS = {
 }
 
 
-def test_memory_without_a_token(server: Server) -> None:
+NAMES = list(ATTACKS)
+
+
+@pytest.mark.parametrize(
+    ("which", "names"),
+    [
+        ("page", NAMES[::2]),  # the servers share this code
+        ("api", NAMES[1::2]),
+        pytest.param("page", NAMES, marks=pytest.mark.exploration),
+        pytest.param("api", NAMES, marks=pytest.mark.exploration),
+    ],
+    ids=["page", "api", "page-all", "api-all"],
+)
+def test_memory_without_a_token(request: pytest.FixtureRequest, which: str, names: list[str]) -> None:
     """The memory stays within its limit for each attack, and for all attacks together."""
+    server: Server = request.getfixturevalue(which)
     assert server.serves()
     idle = server.memory()
-    for name, (sent, together) in ATTACKS.items():
+    for name in names:
+        sent, together = ATTACKS[name]
         server.reset()
         flood(server.port, sent * max(1, 50_000 // len(sent)), together)
         assert server.memory("VmHWM") <= idle + MEMORY, name
