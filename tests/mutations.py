@@ -391,7 +391,13 @@ MUTATIONS = (
         "if False:",
         "tests/genomix/test_sessions.py",
     ),
-    _genomix("session-events-unlimited", "sessions.py", "if queue.qsize() < MAX_EVENTS:", "if True:", "tests/genomix"),
+    _genomix(
+        "session-events-unlimited",
+        "sessions.py",
+        "if queue.qsize() < MAX_EVENTS:",
+        "if True:",
+        "tests/genomix/test_sessions.py",
+    ),
     _genomix(
         "session-expires-at-once",
         "sessions.py",

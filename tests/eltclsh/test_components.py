@@ -15,14 +15,21 @@ from tests.terminal import Terminal
 pytestmark = pytest.mark.ros
 
 
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[worlds.World]:
+    """Start the nodes and genomixd for all tests of the module."""
+    with worlds.world(tmp_path_factory.mktemp("world")) as world:
+        yield world
+
+
 @pytest.fixture
-def guide(tmp_path: Path) -> Iterator[Terminal]:
-    """Start eltclsh and a genomixd with new nodes."""
-    with worlds.world(tmp_path) as world:
-        env = {**world.graph.env, "GENOMIXD": f"127.0.0.1:{world.port}"}
-        with Terminal([str(harness.SCRIPTS / "eltclsh")], env) as terminal:
-            terminal.expect("eltclsh > ")
-            yield terminal
+def guide(world: worlds.World, tmp_path: Path) -> Iterator[Terminal]:
+    """Start eltclsh; the nodes are idle."""
+    env = {**world.graph.env, "GENOMIXD": f"127.0.0.1:{world.port}", "HOME": str(tmp_path)}
+    with Terminal([str(harness.SCRIPTS / "eltclsh")], env) as terminal:
+        terminal.expect("eltclsh > ")
+        yield terminal
+    world.reset()
 
 
 def test_the_guide_typed_at_the_prompt(guide: Terminal) -> None:
@@ -32,16 +39,16 @@ def test_the_guide_typed_at_the_prompt(guide: Terminal) -> None:
     requests = outputs[4:7] + outputs[9:]
     assert requests == [f"::genomix::request{n}" for n in range(1, len(requests) + 1)]
     assert outputs[7:9] == ["", ""]
-    assert guide.run("::genomix::request7 wait 10000").endswith("error")
+    assert guide.run("::genomix::request7 wait 60000").endswith("error")
     assert guide.shown.count(error) <= 1
-    assert guide.run("::genomix::request8 wait 10000") == "done"
-    assert guide.run("::genomix::request9 wait 10000") == "done"
+    assert guide.run("::genomix::request8 wait 60000") == "done"
+    assert guide.run("::genomix::request9 wait 60000") == "done"
     assert guide.run("::genomix::request8 result").startswith("parameters {input {0 {name input")
     assert guide.run("catch {::genomix::request7 result} e; dict get $e ex") == "::rosAFE::e_noSuchParameter"
     assert guide.run("::genomix::request9 result") == "dependencies {0 input 1 preProc 2 gammatone 3 ihc 4 ratemap}"
     # removeProcessor removes the whole tree below preProc
-    guide.run("::genomix::request10 wait 10000")  # there is no element dummyName; the error may be printed here
-    guide.run("::genomix::request11 wait 10000")
+    guide.run("::genomix::request10 wait 60000")  # there is no element dummyName; the error may be printed here
+    guide.run("::genomix::request11 wait 60000")
     assert guide.run("rosAFE::getDependencies preProc") == (
         "ex ::rosAFE::e_noSuchProcessor what {there is no processor 'preProc'; there are: input}"
     )
@@ -95,7 +102,7 @@ def test_missing_parameters_are_asked_for(guide: Terminal) -> None:
     guide.expect("::genomix::request1\n")
     guide.expect("eltclsh > ")
     guide.run(
-        "while {[dict get [bass::Audio] Audio sampleRate] == 0} {after 20}"
+        "while {[dict get [bass::Audio] Audio sampleRate] != 22050} {after 20}"
     )  # Acquire returns before the capture starts
     assert guide.run("dict get [bass::Audio] Audio sampleRate") == "22050"
     # No questions: with `--`, in a script or procedure, with an empty list, or for help.

@@ -32,7 +32,7 @@ def crowd(port: int, count: int, sent: bytes = b"", host: str = "127.0.0.1") -> 
             stack.callback(connection.close)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             connection.bind((host, 0))
-            connection.settimeout(20)
+            connection.settimeout(60)
             connection.connect(("127.0.0.1", port))
             with contextlib.suppress(ConnectionError):  # already disconnected
                 connection.sendall(sent)

@@ -71,7 +71,7 @@ def test_a_goal_is_sent_when_its_result_can_be_received(monkeypatch: pytest.Monk
         done, _ = await asyncio.wait({sending}, timeout=0.2)
         assert not done and action.goal.sent == []
         late.connections = 1
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(60):
             while not action.goal.sent:
                 await asyncio.sleep(0.01)
             action.accept()

@@ -58,7 +58,7 @@ def test_each_command_of_the_guide_has_its_documented_result(fresh_world: World)
     script.append(
         """
         foreach name {modify parameters dependencies signals} request [lrange $results end-3 end] {
-            puts [list $name [$request wait 10000] [catch {$request result} result] $result]
+            puts [list $name [$request wait 60000] [catch {$request result} result] $result]
         }
         set running [concat [lrange $results 4 6] [lrange $results 9 11]]
         puts [list activities {*}[lmap request $running {$request status}]]
@@ -66,7 +66,7 @@ def test_each_command_of_the_guide_has_its_documented_result(fresh_world: World)
     )
     for command in commands[-2:]:
         script.append(f"set last [uplevel #0 {{{command}}}]")
-        script.append("puts [list last [$last wait 10000] [catch {$last result} result] $result]")
+        script.append("puts [list last [$last wait 60000] [catch {$last result} result] $result]")
     script.append("puts [list plain [lrange $results 0 3] [lrange $results 7 8]]")
     lines = run_shell(fresh_world, "eltclsh", "\n".join(script)).stdout.splitlines()
     assert lines[0] == (
@@ -223,7 +223,7 @@ PATTERNS = {
         set all [list [::rosAFE::getParameters &] [::rosAFE::getDependencies {nameProc ratemap} &] \\
             [::rosAFE::getSignals {} &] [::rosAFE::removeProcessor {name preProc} &] \\
             [::rosAFE::preProcPort dummyName &]]
-        show [expr {[lmap r $all {$r wait 5000}] eq {done error done error error} ? "" : [lmap r $all {$r status}]}]
+        show [expr {[lmap r $all {$r wait 60000}] eq {done error done error error} ? "" : [lmap r $all {$r status}]}]
     """,
     "24b: continued lines and comments": """
         set g [genomix::connect $address]

@@ -13,7 +13,7 @@ import rosgraph
 
 from rosafe.client import graph as client_graph
 from tests.genomix.world import Http
-from tests.harness import END_SECONDS, PATIENCE, Graph, free_port, private_graph, wait_for
+from tests.harness import PATIENCE, Graph, free_port, private_graph, wait_for
 
 
 def registrations(graph: Graph, node: str) -> int:
@@ -37,8 +37,8 @@ def test_it_leaves_the_graph_with_all_its_registrations(graph: Graph) -> None:
         for component in ("bass", "rosAFE"):
             wait_for(lambda: Http(port).get(f"/load/{component}"))  # noqa: B023
         wait_for(lambda: registrations(graph, "/genomixd") > 4 * 24)  # four topics of each action
-        assert server.stop(signal.SIGTERM, timeout=END_SECONDS) == 0
-        wait_for(lambda: not registrations(graph, "/genomixd"), 1.5)
+        assert server.stop(signal.SIGTERM) == 0
+        wait_for(lambda: not registrations(graph, "/genomixd"))
         assert not known(graph, "/genomixd")
 
 
@@ -114,7 +114,7 @@ def test_rosafe_live_is_a_node_with_a_name(graph: Graph) -> None:
     with start() as page:
         wait_for(lambda: "/rosafe_live" in graph.nodes(), what=lambda: str(page))
         assert page.stop() == 0
-    wait_for(lambda: not known(graph, "/rosafe_live"), 1.5)
+    wait_for(lambda: not known(graph, "/rosafe_live"))
 
 
 def test_commands_take_the_name_that_roslaunch_gives(graph: Graph, tmp_path: Path) -> None:
@@ -123,4 +123,4 @@ def test_commands_take_the_name_that_roslaunch_gives(graph: Graph, tmp_path: Pat
         with graph.start("rosafe", "record", str(tmp_path / "a.wav"), "__name:=ears") as recorder:
             wait_for(lambda: ("/bass/Audio", "/ears") in graph.readers(), what=lambda: str(recorder))
             recorder.stop(signal.SIGINT)
-        wait_for(lambda: not known(graph, "/ears"), 1.5)
+        wait_for(lambda: not known(graph, "/ears"))

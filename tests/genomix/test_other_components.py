@@ -243,7 +243,7 @@ def test_octave(robot: World) -> None:
         state = arm.State();
         show('state', {state.State.pose.frame, numel(state.State.path)});
         moved = arm.Move('-a', struct('distance', 2, 'speed', 'SLOW'));
-        show('moved', {moved.wait(20), moved.result.moved});
+        show('moved', {moved.wait(60), moved.result.moved});
         show('failed', arm.SetSpeed('RAPID').exception.ex);
         """,
     )

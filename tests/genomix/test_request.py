@@ -220,7 +220,7 @@ def test_tcl(sound: World) -> None:
         show [dict get [rosAFE::request filterbank {fb_cfHz {500 1000}}] topic]
         show [dict get [rosAFE::request time] name]
         set request [rosAFE::request ratemap {fb_nChannels 16} & show callback]
-        show [$request wait 20000] [dict get [$request result] name]
+        show [$request wait 60000] [dict get [$request result] name]
         after 50 {set forever 1}; vwait forever
         set structure [dict remove [dict get [rosAFE::getParameters] parameters gammatone 0] name]
         show [dict get [rosAFE::request ild $structure] name]

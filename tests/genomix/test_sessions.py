@@ -62,7 +62,7 @@ def send(session: Session, component: Component, keep: bool = True, size: int = 
 
 
 async def wait_until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(30):
+    async with asyncio.timeout(60):
         while not condition():
             await asyncio.sleep(0.005)
 

@@ -36,9 +36,9 @@ STEPS = {
     "modify with spaces": ":: rosAFE :: modifyParameter {nameProc input nameParam pp_bRemoveDC newValue 1} &",
     "modify": "::rosAFE::modifyParameter {nameProc input nameParam pp_bRemoveDC newValue 1}",
     "modify the right one": "::rosAFE::modifyParameter {newValue 1 nameParam pp_bRemoveDC nameProc preProc}",
-    "parameters": "set r [::rosAFE::getParameters &]; $r wait 10000; $r result",
-    "dependencies": "set r [::rosAFE::getDependencies {nameProc ratemap} &]; $r wait 10000; $r result",
-    "signals": "set r [::rosAFE::getSignals {} &]; $r wait 10000; lmap {kind all} [dict get [$r result] signals] "
+    "parameters": "set r [::rosAFE::getParameters &]; $r wait 60000; $r result",
+    "dependencies": "set r [::rosAFE::getDependencies {nameProc ratemap} &]; $r wait 60000; $r result",
+    "signals": "set r [::rosAFE::getSignals {} &]; $r wait 60000; lmap {kind all} [dict get [$r result] signals] "
     "{list $kind [dict size $all]}",
     "signals without argument": "string length [::rosAFE::getSignals]; ::rosAFE::getSignal; list fine",
     "a port": "dict keys [dict get [::rosAFE::preProcPort preProc] preProcPort]",
@@ -55,7 +55,7 @@ STEPS = {
     "pp_refSPLdBS 94}; lrange [dict get [::rosAFE::getParameters] parameters preProc 1] 0 19",
     "remove": "::rosAFE::removeProcessor {nameProc flags}; ::rosAFE::removeProcessor {name preProc}",
     "removed": "lmap {kind all} [dict get [::rosAFE::getParameters] parameters] {list $kind [dict size $all]}",
-    "their requests": "concat [list [$preProc wait 10000]] [lmap leaf $leaves {$leaf wait 10000}] "
+    "their requests": "concat [list [$preProc wait 60000]] [lmap leaf $leaves {$leaf wait 60000}] "
     "[list [$input status] [$acquire status]]",
     "their ports": "::rosAFE::ildPort ild",
 }
@@ -63,7 +63,7 @@ STEPS = {
 PRELUDE = """
 proc soon {request} {update; after 150; update; $request status}
 proc frames {port name} {
-    for {set i 0} {$i < 100} {incr i} {
+    for {set i 0} {$i < 1200} {incr i} {
         set message [dict get [::rosAFE::$port $name] $port]
         if {[dict get $message lastFrameIndex] > 0} {return "[dict get $message framesOnPort] frames"}
         after 50

@@ -27,11 +27,6 @@ ARGUMENTS = (
     "--disable-sync",
     "--hide-scrollbars",
 )
-# Animations have ten frames per second instead of sixty: drawing without a graphics card takes most processor time.
-SLOW_FRAMES = """
-const frame = window.requestAnimationFrame.bind(window);
-window.requestAnimationFrame = (draw) => setTimeout(() => frame(draw), 90);
-"""
 
 
 class Browser:
@@ -76,7 +71,6 @@ def browser(downloads: Path | None = None) -> Iterator[Browser]:
         options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
         driver = webdriver.Chrome(service=Service("/usr/bin/chromedriver"), options=options)
         try:
-            driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": SLOW_FRAMES})
             if downloads is not None:
                 where = {"behavior": "allow", "downloadPath": str(downloads)}
                 driver.execute_cdp_cmd("Browser.setDownloadBehavior", where)

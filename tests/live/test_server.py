@@ -62,7 +62,7 @@ def status(world: World, path: str, method: str = "GET", **headers: str) -> tupl
     host, port = world.live.address.rsplit(":", 1)
     lines = {"Host": world.live.address, "Connection": "close", **headers}
     request = f"{method} {path} HTTP/1.1\r\n" + "".join(f"{k}: {v}\r\n" for k, v in lines.items()) + "\r\n"
-    with socket.create_connection((host, int(port)), timeout=20) as connection:
+    with socket.create_connection((host, int(port)), timeout=60) as connection:
         connection.sendall(request.encode("latin-1"))
         answer = b""
         while part := connection.recv(65536):
