@@ -52,7 +52,7 @@ _OFFLINE = (*_SOUNDS, "rosafe.offline.files", "rosafe.offline.sounds")
 COMMANDS: Mapping[str, Sequence[str]] = {  # what commands of `rosafe` import when they run
     "doctor": _SOUNDS,
     "enhance": _OFFLINE,
-    "localize": _OFFLINE,
+    "localize": (*_OFFLINE, "rosafe.localizer_node.node", *NODES),
     "plot": (*_OFFLINE, "matplotlib.figure", "matplotlib.backends.backend_agg"),
     "process": (*_OFFLINE, "h5py", "zarr"),
     "record": (*_SOUNDS, "rosafe.bass.recording.recorder", "rosafe.bass.sources.scene"),

@@ -8,8 +8,7 @@ import os
 import struct
 import subprocess
 import threading
-import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,8 +21,8 @@ from rosafe.bass.sources import base, open_source
 from rosafe.interface import ComponentError
 from tests.bass import bags
 from tests.bass.bags import number, record
-from tests.cli.command import ROSAFE, environment
-from tests.harness import PYTHON
+from tests.cli.command import environment
+from tests.harness import PYTHON, ROOT
 
 GIGABYTE = 2**30
 MAGIC = b"#ROSBAG V2.0\n"
@@ -35,25 +34,31 @@ class Done(NamedTuple):
 
     code: int
     err: str
-    megabytes: float  # maximum resident size
+    megabytes: float  # maximum resident size of the process up to the end of the command
 
 
-# Started by a small process, as the size of the parent counts for a forked process.
+# Records from the devices one after another, without an output.
 MEASURED = """
-import resource, subprocess, sys
-code = subprocess.call(sys.argv[1:])
-print(code, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+import resource, sys
+sys.path.insert(0, sys.argv[1])
+from rosafe.commands.__main__ import main
+for device in sys.argv[2:]:
+    code = main(["record", "--quiet", "--device", device, "--seconds", "5"])
+    sys.stderr.write(f"\\0{code} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}\\0")
+    sys.stderr.flush()
 """
+# A small process starts it, as the size of the parent counts for a forked process.
+START = "import subprocess, sys; sys.exit(subprocess.call(sys.argv[1:]))"
 
 
-def play(device: str) -> Done:
-    """Record from `device` without an output."""
-    command = [str(ROSAFE), "record", "--quiet", "--device", device, "--seconds", "5"]
-    done = subprocess.run(
-        [PYTHON, "-c", MEASURED, *command], env=environment(), capture_output=True, text=True, timeout=150, check=True
-    )
-    code, kilobytes = done.stdout.splitlines()[-1].split()
-    return Done(int(code), done.stderr, int(kilobytes) / 1024)
+def play(devices: Sequence[str]) -> list[Done]:
+    """Record from each device without an output."""
+    arguments = [PYTHON, "-c", START, PYTHON, "-c", MEASURED, str(ROOT), *devices]
+    done = subprocess.run(arguments, env=environment(), capture_output=True, text=True, timeout=300, check=True)
+    *parts, rest = done.stderr.split("\0")
+    assert not rest and len(parts) == 2 * len(devices), done
+    results = [result.split() for result in parts[1::2]]
+    return [Done(int(code), err, int(kB) / 1024) for err, (code, kB) in zip(parts[::2], results, strict=True)]
 
 
 def sparse(path: Path, begin: bytes, size: int) -> Path:
@@ -116,13 +121,13 @@ def chunk_beyond_the_file(folder: Path) -> Path:
 
 def bz2_message(folder: Path) -> Path:
     plain = message(b"", 2**32 - 100)
-    packed = bz2.compress(plain + bytes(300_000_000))
+    packed = bz2.compress(plain + bytes(150_000_000))
     return bags.forge(folder / "a.bag", chunk(packed, 2**32 - 1, b"bz2"))
 
 
 def bz2_of_others(folder: Path) -> Path:
     """A message of another topic is skipped; it is the last one."""
-    plain = record(2, bytes(300_000_000), conn=number(7), time=number(0, 8))
+    plain = record(2, bytes(150_000_000), conn=number(7), time=number(0, 8))
     return bags.forge(folder / "a.bag", chunk(bz2.compress(plain), len(plain), b"bz2"))
 
 
@@ -137,27 +142,31 @@ def window_of_wrong_length(folder: Path) -> Path:
     return bags.forge(folder / "a.bag", chunk(message(plain)))
 
 
-@pytest.mark.parametrize(
-    ("make", "why"),
-    [
-        (zeros, "a.bag: expected a complete bag of format 2.0, got one that is not a bag of format 2.0"),
-        (magic_and_zeros, "was not closed by its recorder, or is truncated"),
-        (older_format, "a.bag: expected a complete bag of format 2.0, got one that is not a bag of format 2.0"),
-        (long_header, "was not closed by its recorder, or is truncated"),
-        (many_connections, "expected at most 10000 connections, got 4294967295"),
-        (long_message, "is damaged: expected a field of at most 134218752 bytes, got 3221225472"),
-        (message_beyond_the_chunk, "is damaged: a record of 100000000 bytes, but only 5 remain"),
-        (chunk_beyond_the_file, "is damaged: expected a field of at most 134218752 bytes, got 4294967295"),
-        (bz2_message, "is damaged: expected a field of at most 134218752 bytes, got 4294967196"),
-        (bz2_of_others, "stream 1 is not in the bag"),
-        (lz4_of_others, "stream 1 is not in the bag"),
-        (window_of_wrong_length, "samples do not fit into a message of 24 bytes"),
-    ],
+MALICIOUS = (
+    (zeros, "a.bag: expected a complete bag of format 2.0, got one that is not a bag of format 2.0"),
+    (magic_and_zeros, "was not closed by its recorder, or is truncated"),
+    (older_format, "a.bag: expected a complete bag of format 2.0, got one that is not a bag of format 2.0"),
+    (long_header, "was not closed by its recorder, or is truncated"),
+    (many_connections, "expected at most 10000 connections, got 4294967295"),
+    (long_message, "is damaged: expected a field of at most 134218752 bytes, got 3221225472"),
+    (message_beyond_the_chunk, "is damaged: a record of 100000000 bytes, but only 5 remain"),
+    (chunk_beyond_the_file, "is damaged: expected a field of at most 134218752 bytes, got 4294967295"),
+    (bz2_message, "is damaged: expected a field of at most 134218752 bytes, got 4294967196"),
+    (bz2_of_others, "stream 1 is not in the bag"),
+    (lz4_of_others, "stream 1 is not in the bag"),
+    (window_of_wrong_length, "samples do not fit into a message of 24 bytes"),
 )
-def test_bags(tmp_path: Path, make: Callable[[Path], Path], why: str) -> None:
-    done = play(f"bag:{make(tmp_path)}")
-    assert done.code == 1 and why in done.err and done.err.count("\n") == 1, done
-    assert done.megabytes < MEGABYTES
+
+
+def test_bags(tmp_path: Path) -> None:
+    devices = []
+    for make, _ in MALICIOUS:
+        folder = tmp_path / make.__name__
+        folder.mkdir()
+        devices.append(f"bag:{make(folder)}")
+    for (make, why), done in zip(MALICIOUS, play(devices), strict=True):
+        assert done.code == 1 and why in done.err and done.err.count("\n") == 1, (make, done)
+        assert done.megabytes < MEGABYTES, (make, done)
 
 
 def test_code_in_a_bag_is_not_run(tmp_path: Path) -> None:
@@ -206,7 +215,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     }
 
 
-@settings(max_examples=600, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(kind=st.sampled_from(("none", "bz2", "lz4")), data=st.data())
 def test_randomly_damaged_bags(
     good: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, data: st.DataObject
@@ -252,29 +261,28 @@ def wav(size: int = 2**32 - 9, channels: int = 2, rate: int = 44100, bits: int =
     return header + struct.pack("<4sI", b"data", size)
 
 
-@pytest.mark.parametrize(
-    ("name", "begin", "size"),
-    [
-        ("zeros.wav", b"", 10 * GIGABYTE),
-        ("zeros.flac", b"fLaC", 10 * GIGABYTE),
-        ("zeros.ogg", b"OggS", 2 * GIGABYTE),
-        ("zeros.mp3", b"ID3\x04\0\0\x7f\x7f\x7f\x7f", 2 * GIGABYTE),
-        ("zeros.aiff", b"FORM\x7f\xff\xff\xffAIFF", 2 * GIGABYTE),
-        ("cut.wav", wav(2**30), 1000),
-        ("channels.wav", wav(channels=1024), 3 * GIGABYTE),
-        ("channels.wav", wav(channels=65535), 3 * GIGABYTE),
-        ("rate.wav", wav(rate=2**32 - 1), 1000),
-        ("rate.wav", wav(3000, rate=2**31 - 1), 3044),
-        ("list.wav", b"RIFF\xff\xff\xff\xffWAVELIST\xf0\xff\xff\xff", 3 * GIGABYTE),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
+SOUND_FILES = (
+    ("zeros.wav", b"", 10 * GIGABYTE),
+    ("zeros.flac", b"fLaC", 10 * GIGABYTE),
+    ("zeros.ogg", b"OggS", 2 * GIGABYTE),
+    ("zeros.mp3", b"ID3\x04\0\0\x7f\x7f\x7f\x7f", 2 * GIGABYTE),
+    ("zeros.aiff", b"FORM\x7f\xff\xff\xffAIFF", 2 * GIGABYTE),
+    ("cut.wav", wav(2**30), 1000),
+    ("channels.wav", wav(channels=1024), 3 * GIGABYTE),
+    ("more_channels.wav", wav(channels=65535), 3 * GIGABYTE),
+    ("rate.wav", wav(rate=2**32 - 1), 1000),
+    ("short_rate.wav", wav(3000, rate=2**31 - 1), 3044),
+    ("list.wav", b"RIFF\xff\xff\xff\xffWAVELIST\xf0\xff\xff\xff", 3 * GIGABYTE),
 )
-def test_sound_files(tmp_path: Path, name: str, begin: bytes, size: int) -> None:
-    done = play(f"file:{sparse(tmp_path / name, begin, size)}")
-    *others, line = done.err.splitlines()
-    assert done.code == 1 and line.startswith("rosafe record: ") and name in line, done
-    assert all("libmpg123" in other for other in others), done  # prints further lines
-    assert done.megabytes < MEGABYTES
+
+
+def test_sound_files(tmp_path: Path) -> None:
+    devices = [f"file:{sparse(tmp_path / name, begin, size)}" for name, begin, size in SOUND_FILES]
+    for (name, _, _), done in zip(SOUND_FILES, play(devices), strict=True):
+        *others, line = done.err.splitlines()
+        assert done.code == 1 and line.startswith("rosafe record: ") and f"/{name}" in line, done
+        assert all("libmpg123" in other for other in others), done  # prints further lines
+        assert done.megabytes < MEGABYTES, (name, done)
 
 
 def test_a_long_silence_is_a_sound_file(tmp_path: Path) -> None:
@@ -321,7 +329,6 @@ def test_paths_that_are_not_files_are_rejected(tmp_path: Path, kind: str) -> Non
         "round",
         "a/b",
     ):
-        begin = time.monotonic()
         with pytest.raises(ComponentError) as caught:
             open_source(f"{kind}:{tmp_path / path}", 0, 10, threading.Event())
-        assert caught.value.ex == "::bass::e_device" and time.monotonic() - begin < 5
+        assert caught.value.ex == "::bass::e_device"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ import pytest
 import rospy
 from std_msgs.msg import Bool
 
+from rosafe.localizer_node.settings import read_settings
 from rosafe.ros import array_msg
 from tests.harness import PATIENCE, Graph, Process, wait_for
 from tests.localizer_node.session import Localizer, acquire, names_of, running_localizer, scene_file
@@ -82,27 +84,26 @@ def port_of(graph: Graph, kind: str) -> str:
 NAN, HUGE = float("nan"), 1e308
 
 
-@pytest.mark.parametrize(
-    ("left", "frames", "index", "problem"),
-    [
-        ((3, 10), 10, 0, "expected 31 channels"),
-        ((31, 10), 11, 0, "expected 31 channels"),
-        ((31, 10), 2**63, 0, "expected 31 channels"),
-        ((31, 0), 0, 0, "expected 31 channels"),
-        ((31, 100), 100, 2**64 - 1, "is out of range"),
-    ],
-)
-def test_malformed_frames(
-    graph: Graph, talking: Localizer, left: tuple[int, int], frames: int, index: int, problem: str
-) -> None:
+def test_malformed_frames(graph: Graph, talking: Localizer) -> None:
     """Messages with the frame indices of others, of the wrong shape; and indices out of range."""
+    malformed = (
+        ((3, 10), 10, 0),
+        ((31, 10), 11, 0),
+        ((31, 10), 2**63, 0),
+        ((31, 0), 0, 0),
+        ((31, 100), 100, 2**64 - 1),
+    )
+    problems = ("expected 31 channels", "is out of range")
     message_class = array_msg(importlib.import_module("rosAFE.msg").rosAFE_TimeFrequencySignalPortStruct)
     topic = port_of(graph, "itd")
     attacker = Attacker(topic, message_class)
     latest: list[int] = []
     subscriber = rospy.Subscriber(topic, message_class, lambda m: latest.append(int(m.lastFrameIndex)), queue_size=1)
+    sent: list[int] = []
 
-    def create(_: int) -> Any:
+    def create(number: int) -> Any:
+        sent.append(1)
+        left, frames, index = malformed[number % len(malformed)]
         return message_class(
             sampleRate=100,
             lastFrameIndex=index or (latest or [1])[-1],
@@ -112,18 +113,20 @@ def test_malformed_frames(
             right=np.zeros((0,)),
         )
 
+    def done() -> bool:
+        return len(sent) > 6 * len(malformed) and all(problem in talking.process.err for problem in problems)
+
     try:
-        attacker.flood(create, lambda: problem in talking.process.err, f"{problem}: {talking.process}")
+        attacker.flood(create, done, f"{problems}: {talking.process}")
     finally:
         subscriber.unregister()
         attacker.close()
 
 
-@pytest.mark.parametrize("value", [NAN, HUGE, -HUGE, 1e99])
 @pytest.mark.parametrize(("kind", "step"), [("ild", 0), ("ratemap", 0), ("ild", 10**9), ("itd", -(10**4))])
-def test_frames_with_strange_values_and_indices(
-    graph: Graph, talking: Localizer, value: float, kind: str, step: int
-) -> None:
+def test_frames_with_strange_values_and_indices(graph: Graph, talking: Localizer, kind: str, step: int) -> None:
+    """Each message has one of several values."""
+    values = (NAN, HUGE, -HUGE, 1e99)
     message_class = array_msg(importlib.import_module("rosAFE.msg").rosAFE_TimeFrequencySignalPortStruct)
     topic = port_of(graph, kind)
     attacker = Attacker(topic, message_class)
@@ -131,8 +134,9 @@ def test_frames_with_strange_values_and_indices(
     subscriber = rospy.Subscriber(topic, message_class, lambda m: latest.append(int(m.lastFrameIndex)), queue_size=1)
     sent: list[int] = []
 
-    def create(_: int) -> Any:
+    def create(number: int) -> Any:
         sent.append(1)
+        value = values[number // 4 % len(values)]
         return message_class(
             sampleRate=100,
             lastFrameIndex=max(1, (latest or [1])[-1] + step),
@@ -143,35 +147,39 @@ def test_frames_with_strange_values_and_indices(
         )
 
     try:
-        attacker.flood(create, lambda: len(sent) > 100, "messages")
+        attacker.flood(create, lambda: len(sent) > 64, "messages")
     finally:
         subscriber.unregister()
         attacker.close()
 
 
 @pytest.mark.parametrize(
-    ("frame", "rate", "seconds"),
+    "times",
     [
-        (None, 0.0, 0.0), (None, NAN, 0.0), (None, 1.0, 0.0), (None, 1e6, 0.0),
-        (2**64 - 1, 16000.0, 0.0), (1, 16000.0, 0.0), (None, 16000.0, -1e6), (None, 16000.0, 1e6), (None, 16000.0, 4e9),
+        [(None, 0.0, 0.0), (None, NAN, 0.0), (None, 1.0, 0.0), (None, 1e6, 0.0)],
+        [(2**64 - 1, 16000.0, 0.0), (1, 16000.0, 0.0)],
+        [(None, 16000.0, -1e6), (None, 16000.0, 1e6), (None, 16000.0, 4e9)],
     ],
-)  # fmt: skip
-def test_hostile_times(graph: Graph, talking: Localizer, frame: int | None, rate: float, seconds: float) -> None:
+    ids=["rates", "indices", "stamps"],
+)
+def test_hostile_times(graph: Graph, talking: Localizer, times: list[tuple[int | None, float, float]]) -> None:
+    """Frame index (None: a possible one), rate, and seconds that are added to the stamp."""
     message_class = importlib.import_module("rosAFE.msg").rosAFE_frameTime
     attacker = Attacker("/rosAFE/frameTime", message_class)
     latest: list[Any] = []
     subscriber = rospy.Subscriber("/rosAFE/frameTime", message_class, latest.append, queue_size=1)
     sent: list[int] = []
 
-    def create(_: int) -> Any:
+    def create(number: int) -> Any:
         sent.append(1)
+        frame, rate, seconds = times[number // 4 % len(times)]
         newest = latest[-1] if latest else message_class()
         moment = min(max(0.0, newest.stamp.to_sec() + seconds), 2.0**32 - 1)
         index = newest.frameIndex + 1 if frame is None else frame
         return message_class(stamp=rospy.Time.from_sec(moment), frameIndex=min(index, 2**64 - 1), sampleRate=rate)
 
     try:
-        attacker.flood(create, lambda: len(sent) > 100, "messages")
+        attacker.flood(create, lambda: len(sent) > 64, "messages")
     finally:
         subscriber.unregister()
         attacker.close()
@@ -186,9 +194,16 @@ def test_a_flood_of_mute(talking: Localizer) -> None:
     publisher.unregister()
 
 
-def test_each_processor_is_removed(graph: Graph, talking: Localizer) -> None:
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        ("itd", "crosscorrelation", "time"),
+        pytest.param(("ic", "ratemap", "ild", "innerhaircell", "filterbank"), marks=pytest.mark.exploration),
+    ],
+)
+def test_each_processor_is_removed(graph: Graph, talking: Localizer, kinds: tuple[str, ...]) -> None:
     """Also those with children, which are removed with it."""
-    for kind in ("itd", "ic", "ratemap", "ild", "crosscorrelation", "innerhaircell", "filterbank", "time"):
+    for kind in kinds:
         name = next(name for name in names_of(graph) if name.startswith(kind))
         count = talking.process.err.count("of rosAFE was removed; it is requested again")
         assert graph.call("/rosAFE/removeProcessor", name=name).genom_success
@@ -252,27 +267,39 @@ def test_no_times(graph: Graph, bass: Process, device: str, sphere_model: Path) 
 @pytest.mark.parametrize(
     ("parameter", "value", "problem"),
     [
-        ("head", "5", "head: expected a text, got 5"),
+        ("head", 5, "head: expected a text, got 5"),
         ("seconds", "abc", "seconds: expected a number from 0.01 to 60, got 'abc'"),
-        ("seconds", "true", "seconds: expected a number from 0.01 to 60, got True"),
-        ("seconds", ".nan", "seconds: expected a number from 0.01 to 60, got nan"),
-        ("audio_delay", "[1]", "audio_delay: expected a number from -5 to 5, got [1]"),
-        ("noise", "{a: 1}", "noise: expected a text, got"),
-        ("noise", "/", "/: expected a file of rosafe localize --calibrate-noise"),
-        ("world_frame", "3.5", "world_frame: expected a text, got 3.5"),
+        ("seconds", True, "seconds: expected a number from 0.01 to 60, got True"),
+        ("seconds", NAN, "seconds: expected a number from 0.01 to 60, got nan"),
+        ("audio_delay", [1], "audio_delay: expected a number from -5 to 5, got [1]"),
+        ("noise", {"a": 1}, "noise: expected a text, got"),
+        ("world_frame", 3.5, "world_frame: expected a text, got 3.5"),
         ("connect", "a//b c", "connect: expected a ROS name"),
-        ("head", "/dev/zero", "/dev/zero: expected a"),
-        ("head", "/", "/: expected a"),
-        ("noise", "/dev/zero", "/dev/zero: expected a"),
     ],
 )
-def test_unsuitable_parameters(graph: Graph, parameter: str, value: str, problem: str) -> None:
-    graph.run("rosparam", "set", f"/strange/{parameter}", value)
+def test_unsuitable_parameters(graph: Graph, parameter: str, value: Any, problem: str) -> None:
+    graph.client()
+    rospy.set_param(f"/strange/{parameter}", value)
     try:
-        done = graph.run("scripts/rosafe", "localize", "--name", "strange", check=False)
+        with pytest.raises(ValueError, match=re.escape(problem)):
+            read_settings({}, "/strange/")
     finally:
-        graph.run("rosparam", "delete", f"/strange/{parameter}")
-    assert done.returncode != 0 and problem in done.stderr and "Traceback" not in done.stderr, done.stderr
+        rospy.delete_param(f"/strange/{parameter}")
+
+
+def test_unsuitable_parameters_of_the_command(graph: Graph) -> None:
+    graph.client()
+    for parameter, value, problem in (
+        ("audio_delay", [1], "audio_delay: expected a number from -5 to 5, got [1]"),
+        ("head", "/dev/zero", "/dev/zero: expected a"),
+        ("noise", "/", "/: expected a file of rosafe localize --calibrate-noise"),
+    ):
+        rospy.set_param(f"/strange/{parameter}", value)
+        try:
+            done = graph.run("rosafe", "localize", "--name", "strange", check=False)
+        finally:
+            rospy.delete_param(f"/strange/{parameter}")
+        assert done.returncode != 0 and problem in done.stderr and "Traceback" not in done.stderr, done.stderr
 
 
 def test_files_that_block(graph: Graph, tmp_path: Path) -> None:
@@ -280,15 +307,15 @@ def test_files_that_block(graph: Graph, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
     for option in ("--noise", "--head"):
         file = str(tmp_path / "fifo")
-        done = graph.run("scripts/rosafe", "localize", "--name", "strange", option, file, check=False)
+        done = graph.run("rosafe", "localize", "--name", "strange", option, file, check=False)
         assert done.returncode != 0 and f"{tmp_path / 'fifo'}: expected a" in done.stderr, done.stderr
 
 
-@pytest.mark.parametrize("path", ["/proc/noise.json", "/dev/full"])
-def test_a_noise_level_that_cannot_be_written(graph: Graph, talking: Localizer, sphere_model: Path, path: str) -> None:
+def test_a_noise_level_that_cannot_be_written(graph: Graph, talking: Localizer, sphere_model: Path) -> None:
     """The command says so; the processors that the localizer uses remain."""
     before = names_of(graph)
-    command = ("rosafe", "localize", "--calibrate-noise", "0.5", "--noise", path, "--head", str(sphere_model))
-    done = graph.run(*command, check=False)
-    assert done.returncode != 0 and path in done.stderr and "Traceback" not in done.stderr, done.stderr
-    assert names_of(graph) == before
+    for path in ("/proc/noise.json", "/dev/full"):
+        command = ("rosafe", "localize", "--calibrate-noise", "0.5", "--noise", path, "--head", str(sphere_model))
+        done = graph.run(*command, check=False)
+        assert done.returncode != 0 and path in done.stderr and "Traceback" not in done.stderr, done.stderr
+        assert names_of(graph) == before

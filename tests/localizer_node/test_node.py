@@ -108,7 +108,9 @@ def test_the_end_of_the_sound(graph: Graph, localizer: Localizer, talker: Path, 
     assert ids == sorted(ids), "ids are not used again"
 
 
-@pytest.mark.parametrize("rate", [22050, 32000, 48000])
+@pytest.mark.parametrize(
+    "rate", [22050, *(pytest.param(rate, marks=pytest.mark.exploration) for rate in (32000, 48000))]
+)
 def test_sample_rates(
     graph: Graph, bass: Process, talker: Path, tmp_path_factory: pytest.TempPathFactory, tmp_path: Path, rate: int
 ) -> None:
@@ -128,7 +130,12 @@ def test_sample_rates(
 
 
 @pytest.mark.parametrize(
-    ("rate", "block", "created"), [(16000, 1600, False), (22050, 1105, True), (16000, 2048, False)]
+    ("rate", "block", "created"),
+    [
+        pytest.param(16000, 1600, False, marks=pytest.mark.exploration),
+        (22050, 1105, True),
+        (16000, 2048, False),
+    ],
 )
 def test_offline_and_live_agree(
     graph: Graph,
@@ -148,7 +155,7 @@ def test_offline_and_live_agree(
 
     model = tmp_path / "sphere.head"
     models.learn(tmp_path_factory, rate).save(model)
-    silence, sound = np.zeros((20 * block, 2), np.int32), two_talkers(8.0, rate)
+    silence, sound = np.zeros((20 * block, 2), np.int32), two_talkers(6.0, rate)
     for name, samples in (("silence", silence), ("sound", sound)):
         soundfile.write(tmp_path / f"{name}.wav", samples, rate, subtype="PCM_32")
     options = ("--head", str(model), "--rosafe", "exact")
@@ -185,16 +192,16 @@ def test_offline_and_live_agree(
             compared.append(np.abs(found["posterior"][nearest] - np.array(message.probability)).max())
             certain.append(found["posterior"][nearest].max())
     if block % round(hop) == 0:
-        assert len(compared) >= 40 and min(certain) < 0.9
+        assert len(compared) >= 20 and min(certain) < 0.9
         assert np.max(compared) < 1e-6, (np.median(compared), np.max(compared))
     near = []
-    for message in list(tracked)[-40:]:
+    for message in list(tracked)[-30:]:
         at = (
             clock.frameIndex + (message.header.stamp.to_sec() - clock.stamp.to_sec()) * clock.sampleRate + len(silence)
         ) / rate
         sources = [t["azimuth"][int(np.abs(t["time"] - at).argmin())] for t in offline.tracks if t["first_time"] < at]
         near += [min(abs(azimuth - other) for other in sources) < 5 for azimuth in present(message)]
-    assert len(near) > 20 and np.mean(near) > 0.9, near
+    assert len(near) > 10 and np.mean(near) > 0.9, near
 
 
 def two_talkers(seconds: float, rate: int) -> np.ndarray:
@@ -235,12 +242,12 @@ def test_two_talkers_and_a_turning_head(
     ):
         acquire(graph, device)
         first = localizer.sources(lambda message: bool(present(message))).header.stamp.to_sec()
-        wait_for(lambda: messages[-1].header.stamp.to_sec() > first + 14)
+        wait_for(lambda: messages[-1].header.stamp.to_sec() > first + 10)
         state = localizer.state(lambda entries: True)
     assert {message.header.frame_id for message in messages} == {"world"}
     begin = first + 3  # certain after a turn of the head
     received = [message for message in messages if begin < message.header.stamp.to_sec()]
-    assert len(received) > 50
+    assert len(received) > 25
     time = np.array([truth.stamp.to_sec() for truth in truths])
     at, errors = [], []
     both = 0
