@@ -62,7 +62,7 @@ print(json.dumps({{name: bool(np.allclose(joined[name], result[name]) and result
 @pytest.mark.ros
 def test_in_a_running_node(folder: Path) -> None:
     with mock.patch.dict(os.environ, ROSAFE_PLUGINS=str(folder)), worlds.world(folder.parent) as world:
-        world.http.send("bass/Acquire", ["scene:"])
+        world.http.send("bass/Acquire", ["scene:", 20000, 1000])
         world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
 
         # the live page creates and plots each of them
@@ -71,7 +71,7 @@ def test_in_a_running_node(folder: Path) -> None:
                 for kind in KINDS:
                     answer: dict[str, Any] = {}
                     while "ok" not in answer:  # until sound has arrived
-                        answer = await client.request("build", representation=kind, nFramesPerBlock=4410)
+                        answer = await client.request("build", representation=kind, nFramesPerBlock=2000)
                         assert "ok" in answer or "e_noData" in answer["error"], answer
                 views = await client.subscribe(*({"what": "picture", "name": name} for name in NAMES.values()))
                 while not all(client.pieces.get(view["number"]) for view in views):

@@ -181,6 +181,7 @@ def test_check_reports_failures_and_successes(tmp_path: Path) -> None:
     file.write_text(good("mine", "print('noise')"))
     done = rosafe("check", str(file), folder=empty)
     assert (done.returncode, done.stdout.split()[:3]) == (0, ["ok", f"{file}:", "mine:"])
+    assert "mine takes " in done.stdout  # its running time
     file.write_text(good("ild"))
     done = rosafe("check", str(file), folder=tmp_path)
     assert done.returncode == 1

@@ -64,7 +64,7 @@ def world(folder: Path) -> Iterator[worlds.World]:
     """Return nodes with sound of a scene and a tree down to the ratemap."""
     with mock.patch.dict(os.environ, ROSAFE_PLUGINS=str(folder)), worlds.world(folder.parent) as this:
         this.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
-        this.http.send("bass/Acquire", ["scene:"])
+        this.http.send("bass/Acquire", ["scene:", 20000, 1000])
         wait_for(lambda: "/bass/Audio" in this.graph.topics())
         wait_for(lambda: started(this))
         yield this
@@ -73,7 +73,7 @@ def world(folder: Path) -> Iterator[worlds.World]:
 def started(world: worlds.World) -> bool:
     """Create the tree down to the ratemap; return False before sound has arrived."""
     try:
-        world.http.call("rosAFE/request", {"representation": "ratemap", "nFramesPerBlock": 4410})
+        world.http.call("rosAFE/request", {"representation": "ratemap", "nFramesPerBlock": 2000})
     except worlds.HttpError as problem:
         assert problem.ex == "::rosAFE::e_noData"
         return False
@@ -153,7 +153,7 @@ def test_a_stage_that_does_not_return_is_reported_and_blocks_no_other(world: wor
     assert text.startswith(f"stuck (plugin hangs ({folder}/hangs.py)) is slow: one call has been running for")
     assert "stuck (plugin hangs" in log(world)
     index = newest(world, "ratemap_0")
-    wait_for(lambda: newest(world, "ratemap_0") > index + 5 * 4410)
+    wait_for(lambda: newest(world, "ratemap_0") > index + 5 * 2000)
     world.http.call("rosAFE/removeProcessor", ["stuck"])
     assert "stuck" not in names(world)
     (folder / "free").touch()

@@ -50,13 +50,18 @@ CLASHES = {
 }
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """Return a folder with the representation of the document."""
-    path = tmp_path / "my representations"
+def example(parent: Path) -> Path:
+    """Create a folder with the representation of the document."""
+    path = parent / "my representations"
     path.mkdir()
     (path / "zerocrossings.py").write_text(PYTHON_BLOCKS[0])
     return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder with the representation of the document."""
+    return example(tmp_path)
 
 
 def test_the_example_is_short() -> None:
@@ -131,13 +136,14 @@ def test_an_installed_package(folder: Path, tmp_path: Path) -> None:
 # --- on the graph -----------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def world(folder: Path) -> Iterator[worlds.World]:
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[worlds.World]:
     """Return nodes and genomixd in an environment with the plugin and a broken one."""
+    folder = example(tmp_path_factory.mktemp("world"))
     (folder / "broken.py").write_text("import nothing_like_this")
     with mock.patch.dict(os.environ, ROSAFE_PLUGINS=str(folder)), worlds.world(folder.parent) as this:
         this.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
-        this.http.send("bass/Acquire", ["scene:"])
+        this.http.send("bass/Acquire", ["scene:", 20000, 1000])
         wait_for(lambda: "/bass/Audio" in this.graph.topics())
         yield this
 
