@@ -80,7 +80,7 @@ def assert_same(got: dict[str, Any], expected: dict[str, Any]) -> None:
 
 @with_kernels
 @given(sizes=sizes, given_parameters=parameters)
-@settings(deadline=None, max_examples=10)
+@settings(deadline=None, max_examples=4)
 def test_all_representations_are_independent_of_blocks(sizes: list[int], given_parameters: dict[str, Any]) -> None:
     options: dict[str, Any] = {"parameters": {**FEW, **given_parameters}, "outputs": sorted(BUILTIN)}
     with at_most(0) as lengths:

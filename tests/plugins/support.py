@@ -8,6 +8,9 @@ from pathlib import Path
 
 from tests.harness import PATIENCE, PYTHON, ROOT
 
+# For code of `python`: check_representation tries shorter sounds. tests/plugins/test_faults.py tries the usual ones.
+SHORT = "from rosafe import testing\ntesting._LONG_SECONDS, testing._COST_SECONDS = 2.0, 0.1\n"
+
 
 def python(code: str, folder: Path, **env: str) -> subprocess.CompletedProcess[str]:
     """Run `code` in a new process whose plugins are in `folder`."""

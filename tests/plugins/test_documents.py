@@ -10,7 +10,7 @@ import pytest
 
 from tests.harness import ROOT
 
-from .support import python
+from .support import SHORT, python
 
 TEXT = (ROOT / "docs" / "own-representation.md").read_text("utf-8")
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -62,7 +62,7 @@ assert not PROBLEMS, PROBLEMS
 for kind in {kinds}:
     assert next(iter(check_representation(STAGES[kind], seconds=0.1))) == kind
 """
-    done = python(code, folder)
+    done = python(SHORT + code, folder)
     assert done.returncode == 0, done.stderr
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -12,7 +14,7 @@ from unittest import mock
 import pytest
 
 from tests.genomix import world as worlds
-from tests.harness import wait_for
+from tests.harness import ROOT, wait_for
 from tests.live.world import live, page
 from tests.plugins.stages import FRAMED, PLAIN, SAMPLES, Fault, text_of
 from tests.plugins.support import python
@@ -28,7 +30,8 @@ NAMES = {kind: f"{'nth' if kind == 'everyNth' else kind}_0" for kind in KINDS}  
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the nine plugins."""
-    path = tmp_path_factory.mktemp("plugins")
+    path = tmp_path_factory.mktemp("plugins") / "my plugins"
+    path.mkdir()
     for name in ("zerocrossings.py", "bands.py", "slowratemap.py"):
         (path / name).write_text(plugins()[name])
     old = Path(__file__).with_name("plugins_0_2") / "oldnames.py"
@@ -59,53 +62,122 @@ print(json.dumps({{name: bool(np.allclose(joined[name], result[name]) and result
     assert all(reported.values()) and len(reported) == len(KINDS) + 2
 
 
+@pytest.fixture(scope="module")
+def world(folder: Path) -> Iterator[worlds.World]:
+    """Return nodes and genomixd in an environment with the plugins and a broken one."""
+    (folder / "broken.py").write_text("import nothing_like_this")
+    with mock.patch.dict(os.environ, ROSAFE_PLUGINS=str(folder)), worlds.world(folder.parent) as this:
+        this.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
+        this.http.send("bass/Acquire", ["scene:", 20000, 1000])
+        wait_for(lambda: "/bass/Audio" in this.graph.topics())
+        yield this
+    (folder / "broken.py").unlink()
+
+
 @pytest.mark.ros
-def test_in_a_running_node(folder: Path) -> None:
-    with mock.patch.dict(os.environ, ROSAFE_PLUGINS=str(folder)), worlds.world(folder.parent) as world:
-        world.http.send("bass/Acquire", ["scene:", 20000, 1000])
-        world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
+def test_in_a_running_node(world: worlds.World, folder: Path) -> None:
+    # the live page creates and plots each of them
+    async def scenario(address: Any) -> None:
+        async with page(address) as client:
+            for kind in KINDS:
+                answer: dict[str, Any] = {}
+                while "ok" not in answer:  # until sound has arrived
+                    answer = await client.request("build", representation=kind, nFramesPerBlock=2000)
+                    assert "ok" in answer or "e_noData" in answer["error"], answer
+            views = await client.subscribe(*({"what": "picture", "name": name} for name in NAMES.values()))
+            while not all(client.pieces.get(view["number"]) for view in views):
+                await client.receive()
 
-        # the live page creates and plots each of them
-        async def scenario(address: Any) -> None:
-            async with page(address) as client:
-                for kind in KINDS:
-                    answer: dict[str, Any] = {}
-                    while "ok" not in answer:  # until sound has arrived
-                        answer = await client.request("build", representation=kind, nFramesPerBlock=2000)
-                        assert "ok" in answer or "e_noData" in answer["error"], answer
-                views = await client.subscribe(*({"what": "picture", "name": name} for name in NAMES.values()))
-                while not all(client.pieces.get(view["number"]) for view in views):
-                    await client.receive()
+    with live(world.graph) as shown:
+        asyncio.run(asyncio.wait_for(scenario(shown), 120))
 
-        with live(world.graph) as shown:
-            asyncio.run(asyncio.wait_for(scenario(shown), 120))
+    # HTTP and ROS
+    there = {p["name"]: p for p in world.http.call("rosAFE/getProcessors")["processors"]}
+    topics = world.graph.topics()
+    for name in NAMES.values():
+        assert there[name]["topic"] in topics
+        parts = world.http.call("rosAFE/getRepresentation", [name])["parts"]
+        assert parts and all(part["lastFrameIndex"] > 0 for part in parts)
+    answer = world.graph.run("rosservice", "call", "/rosAFE/getDependencies", "{nameProc: meanSquare_0}").stdout
+    assert "nth_0" in answer
 
-        # HTTP and ROS
-        there = {p["name"]: p for p in world.http.call("rosAFE/getProcessors")["processors"]}
-        topics = world.graph.topics()
-        for name in NAMES.values():
-            assert there[name]["topic"] in topics
-            parts = world.http.call("rosAFE/getRepresentation", [name])["parts"]
-            assert parts and all(part["lastFrameIndex"] > 0 for part in parts)
-        answer = world.graph.run("rosservice", "call", "/rosAFE/getDependencies", "{nameProc: meanSquare_0}").stdout
-        assert "nth_0" in answer
-
-        # Tcl
-        lines = world.lines(
-            "set g [::genomix::connect $address]\n$g load rosAFE\n"
-            + "\n".join(
-                f"show [dict exists [::rosAFE::{kind}Port {name}] {kind}Port sampleRate]"
-                for kind, name in NAMES.items()
-            )
+    # Tcl
+    lines = world.lines(
+        "set g [::genomix::connect $address]\n$g load rosAFE\n"
+        + "\n".join(
+            f"show [dict exists [::rosAFE::{kind}Port {name}] {kind}Port sampleRate]" for kind, name in NAMES.items()
         )
-        assert lines[-len(KINDS) :] == ["1"] * len(KINDS)
+    )
+    assert lines[-len(KINDS) :] == ["1"] * len(KINDS)
 
-        # setups
-        setup = folder.parent / "setup.yaml"
-        world.graph.run("rosafe", "setup", "save", str(setup))
-        world.http.call("rosAFE/Stop")
-        assert world.http.call("rosAFE/getProcessors")["processors"] == []
-        world.graph.run("rosafe", "setup", "load", str(setup))
-        wait_for(
-            lambda: set(NAMES.values()) <= {p["name"] for p in world.http.call("rosAFE/getProcessors")["processors"]}
+    # setups
+    setup = folder.parent / "setup.yaml"
+    world.graph.run("rosafe", "setup", "save", str(setup))
+    world.http.call("rosAFE/Stop")
+    assert world.http.call("rosAFE/getProcessors")["processors"] == []
+    world.graph.run("rosafe", "setup", "load", str(setup))
+    wait_for(lambda: set(NAMES.values()) <= {p["name"] for p in world.http.call("rosAFE/getProcessors")["processors"]})
+    world.http.call("rosAFE/Stop")
+
+
+@pytest.mark.ros
+def test_all_interfaces(world: worlds.World) -> None:
+    def shell(command: str) -> str:
+        return world.graph.run(*shlex.split(command)).stdout
+
+    changing = "rosservice call /rosAFE/modifyParameter \"{{nameProc: zc2, nameParam: zc_threshold, newValue: '{}'}}\""
+
+    # one request for the whole chain, from the shell
+    request = f". {ROOT}/scripts/env.sh && rosafe request zeroCrossings zc_wSizeSec=0.05 fb_nChannels=4 --json"
+    reported = json.loads(world.graph.run("bash", "-c", request).stdout)
+    assert reported["created"][-1] == "zeroCrossings_0"
+    parent = reported["dependencies"][-2]
+
+    # service, topic and modifyParameter with the commands of ROS
+    assert "genom_success: True" in shell(
+        f"rosservice call /rosAFE/ZeroCrossingsProc '{{name: zc2, upperDepName: {parent}, zc_hSizeSec: 0.02}}'"
+    )
+    assert "numberOfChannels: 4" in shell("rostopic echo -n 1 /rosAFE/zeroCrossingsPort/zc2")
+    refused = shell(changing.format("2"))
+    assert "genom_success: False" in refused
+    assert "e_badNewValue" in refused
+    assert "genom_success: True" in shell(changing.format("0.5"))
+
+    # HTTP: processors, outputs, help
+    (found,) = [p for p in world.http.call("rosAFE/getProcessors")["processors"] if p["name"] == "zc2"]
+    assert (found["kind"], found["upperDepName"], found["rate"]) == ("zeroCrossings", parent, 50.0)
+    assert (found["shape"], found["axes"]) == ([2, 4], ["ear", "channel"])
+    assert {"name": "zc_threshold", "value": "0.5"} in found["parameters"]
+    (part,) = wait_for(
+        lambda: (
+            (parts := world.http.call("rosAFE/getRepresentation", ["zeroCrossings_0"])["parts"])[0]["data"] and parts
         )
+    )
+    assert (part["name"], part["axes"]) == ("zeroCrossings", ["ear", "channel", "time"])
+    assert max(part["data"]) > 100
+    described = world.http.get("/describe/rosAFE")
+    assert described["representations"]["zeroCrossings"]["parent"] == "gammatone"
+    assert "zeroCrossings" not in world.http.call("rosAFE/getParameters")["parameters"]
+
+    # Tcl: request, port, help
+    lines = world.lines(f"""
+        set g [::genomix::connect $address]
+        $g load rosAFE
+        ::rosAFE::ZeroCrossingsProc {{name zc3 upperDepName {parent}}} &
+        while {{[catch {{::rosAFE::getDependencies {{nameProc zc3}}}}]}} {{after 20}}
+        show [dict get [::rosAFE::zeroCrossingsPort zc3] zeroCrossingsPort numberOfChannels]
+        show [string match *zc_threshold* [::rosAFE::ZeroCrossingsProc -h]]
+    """)
+    assert lines[-2:] == ["4", "1"]
+
+    # and an action
+    assert "/rosAFE/ZeroCrossingsProc/goal" in {topic for topic, _ in world.graph.readers()}
+
+
+@pytest.mark.ros
+def test_a_broken_one_is_in_the_log_and_in_doctor(world: worlds.World) -> None:
+    """The node continues; log and doctor contain the file and the error."""
+    log = "".join(path.read_text("utf-8", "replace") for path in (world.graph.home / ".ros").rglob("*.log"))
+    assert "broken.py: ModuleNotFoundError" in log
+    reported = world.graph.run("rosafe", "doctor", check=False)
+    assert "broken.py: ModuleNotFoundError" in reported.stdout

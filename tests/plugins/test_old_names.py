@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from .support import python
+from .support import SHORT, python
 
 PLUGINS = Path(__file__).with_name("plugins_0_2")
 
@@ -18,7 +18,7 @@ assert not PROBLEMS, PROBLEMS
 for kind in ("zeroCrossings", "everyNth", "meanSquare", "fineIld"):
     check_representation(STAGES[kind], seconds=0.1)
 """
-    done = python(code, PLUGINS)
+    done = python(SHORT + code, PLUGINS)
     assert done.returncode == 0, done.stderr
 
 

@@ -1,18 +1,14 @@
-"""The representation of docs/own-representation.md in all interfaces; broken plugins are reported and left out."""
+"""The representation of docs/own-representation.md; broken plugins are reported and left out."""
 
 from __future__ import annotations
 
 import json
-import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from unittest import mock
 
 import pytest
 
-from tests.genomix import world as worlds
-from tests.harness import ROOT, wait_for
+from tests.harness import ROOT
 
 from .support import python
 
@@ -50,18 +46,13 @@ CLASHES = {
 }
 
 
-def example(parent: Path) -> Path:
-    """Create a folder with the representation of the document."""
-    path = parent / "my representations"
-    path.mkdir()
-    (path / "zerocrossings.py").write_text(PYTHON_BLOCKS[0])
-    return path
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Return a folder with the representation of the document."""
-    return example(tmp_path)
+    path = tmp_path / "my representations"
+    path.mkdir()
+    (path / "zerocrossings.py").write_text(PYTHON_BLOCKS[0])
+    return path
 
 
 def test_the_example_is_short() -> None:
@@ -131,80 +122,3 @@ def test_an_installed_package(folder: Path, tmp_path: Path) -> None:
     code = "from rosafe.representations import KINDS, PROBLEMS; print(list(KINDS)[-1], PROBLEMS)"
     done = python(code, folder, ROSAFE_PLUGINS="", PYTHONPATH=f"{site}:{ROOT}")
     assert done.stdout == "zeroCrossings []\n"
-
-
-# --- on the graph -----------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[worlds.World]:
-    """Return nodes and genomixd in an environment with the plugin and a broken one."""
-    folder = example(tmp_path_factory.mktemp("world"))
-    (folder / "broken.py").write_text("import nothing_like_this")
-    with mock.patch.dict(os.environ, ROSAFE_PLUGINS=str(folder)), worlds.world(folder.parent) as this:
-        this.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
-        this.http.send("bass/Acquire", ["scene:", 20000, 1000])
-        wait_for(lambda: "/bass/Audio" in this.graph.topics())
-        yield this
-
-
-@pytest.mark.ros
-def test_all_interfaces(world: worlds.World) -> None:
-    def shell(command: str) -> str:
-        return world.graph.run("bash", "-c", f". {ROOT}/scripts/env.sh && {command}").stdout
-
-    changing = "rosservice call /rosAFE/modifyParameter \"{{nameProc: zc2, nameParam: zc_threshold, newValue: '{}'}}\""
-
-    # one request for the whole chain, from the shell
-    reported = json.loads(shell("rosafe request zeroCrossings zc_wSizeSec=0.05 fb_nChannels=4 --json"))
-    assert reported["created"][-1] == "zeroCrossings_0"
-    parent = reported["dependencies"][-2]
-
-    # service, topic and modifyParameter with the commands of ROS
-    assert "genom_success: True" in shell(
-        f"rosservice call /rosAFE/ZeroCrossingsProc '{{name: zc2, upperDepName: {parent}, zc_hSizeSec: 0.02}}'"
-    )
-    assert "numberOfChannels: 4" in shell("rostopic echo -n 1 /rosAFE/zeroCrossingsPort/zc2")
-    refused = shell(changing.format("2"))
-    assert "genom_success: False" in refused
-    assert "e_badNewValue" in refused
-    assert "genom_success: True" in shell(changing.format("0.5"))
-
-    # HTTP: processors, outputs, help
-    (found,) = [p for p in world.http.call("rosAFE/getProcessors")["processors"] if p["name"] == "zc2"]
-    assert (found["kind"], found["upperDepName"], found["rate"]) == ("zeroCrossings", parent, 50.0)
-    assert (found["shape"], found["axes"]) == ([2, 4], ["ear", "channel"])
-    assert {"name": "zc_threshold", "value": "0.5"} in found["parameters"]
-    (part,) = wait_for(
-        lambda: (
-            (parts := world.http.call("rosAFE/getRepresentation", ["zeroCrossings_0"])["parts"])[0]["data"] and parts
-        )
-    )
-    assert (part["name"], part["axes"]) == ("zeroCrossings", ["ear", "channel", "time"])
-    assert max(part["data"]) > 100
-    described = world.http.get("/describe/rosAFE")
-    assert described["representations"]["zeroCrossings"]["parent"] == "gammatone"
-    assert "zeroCrossings" not in world.http.call("rosAFE/getParameters")["parameters"]
-
-    # Tcl: request, port, help
-    lines = world.lines(f"""
-        set g [::genomix::connect $address]
-        $g load rosAFE
-        ::rosAFE::ZeroCrossingsProc {{name zc3 upperDepName {parent}}} &
-        while {{[catch {{::rosAFE::getDependencies {{nameProc zc3}}}}]}} {{after 20}}
-        show [dict get [::rosAFE::zeroCrossingsPort zc3] zeroCrossingsPort numberOfChannels]
-        show [string match *zc_threshold* [::rosAFE::ZeroCrossingsProc -h]]
-    """)
-    assert lines[-2:] == ["4", "1"]
-
-    # and an action
-    assert "/rosAFE/ZeroCrossingsProc/goal" in {topic for topic, _ in world.graph.readers()}
-
-
-@pytest.mark.ros
-def test_a_broken_one_is_in_the_log_and_in_doctor(world: worlds.World) -> None:
-    """The node continues; log and doctor contain the file and the error."""
-    log = "".join(path.read_text("utf-8", "replace") for path in (world.graph.home / ".ros").rglob("*.log"))
-    assert "broken.py: ModuleNotFoundError" in log
-    reported = world.graph.run("rosafe", "doctor", check=False)
-    assert "broken.py: ModuleNotFoundError" in reported.stdout

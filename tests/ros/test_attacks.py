@@ -36,9 +36,12 @@ def node(graph: Graph, component: str, name: str) -> Iterator[Target]:
         yield Target(graph, process, name)
 
 
-@pytest.fixture(scope="module", params=["rosAFE", "bass"])
+BOTH = pytest.mark.parametrize("target", ["rosAFE", "bass"], indirect=True)
+
+
+@pytest.fixture(scope="module", params=["rosAFE", pytest.param("bass", marks=pytest.mark.exploration)])
 def target(graph: Graph, request: pytest.FixtureRequest) -> Iterator[Target]:
-    """Provide each of the two nodes, which must be healthy after the test."""
+    """Provide a node, which must be healthy after the test; both have the same servers."""
     with node(graph, request.param, f"{request.param}_attacked") as target:
         yield target
 
@@ -132,6 +135,7 @@ def test_a_header_sent_byte_by_byte_is_accepted(target: Target) -> None:
 # --- lengths ----------------------------------------------------------------------------------------------------
 
 
+@BOTH
 def test_excessive_lengths_are_rejected(target: Target) -> None:
     """Of headers, requests, HTTP bodies and HTTP headers; repetitions of each are one line in the log."""
     bomb = b"<value><i4>1</i4></value>" * 10
@@ -186,6 +190,7 @@ def test_incomplete_or_missing_requests(target: Target) -> None:
         assert b"no_such_remote" in patient.recv(4096)
 
 
+@BOTH
 def test_invalid_requests_get_an_answer(target: Target) -> None:
     with target.needs_no_resources():
         for garbage in (b"", b"x", length(HUGE) + b"x", b"\xff" * 5000):
@@ -223,6 +228,7 @@ def test_the_soft_limit_is_raised(target: Target) -> None:
     assert int(soft) == min(handshake_server.DESCRIPTORS, int(hard)) or int(soft) > handshake_server.DESCRIPTORS
 
 
+@BOTH
 def test_without_descriptors_the_node_waits_and_continues(target: Target) -> None:
     """Subscribers that never read use all descriptors; after their end all waiting clients are served."""
     pid = target.process.pid
@@ -381,10 +387,10 @@ def test_lists_of_unreachable_publishers_need_few_resources(afe: tuple[Session, 
 def test_a_slightly_too_long_window_is_rejected_and_the_stream_continues(afe: tuple[Session, Target]) -> None:
     session, _ = afe
     microphone = session.listen()
-    wait_for(lambda: microphone.subscribed, 20)
+    wait_for(lambda: microphone.subscribed)
     before = int(session.health(lambda entries: int(entries["messages"]) > 0)["messages"])
     microphone.publish_bytes(bytes(20) + 2 * (length(MAX_WINDOW + 1) + bytes(4 * (MAX_WINDOW + 1))) + bytes(8))
-    wait_for(lambda: session.health(lambda entries: entries["refused"] == "1"), 30)
+    wait_for(lambda: session.health(lambda entries: entries["refused"] == "1"))
     microphone.play(noise(400))
     health = session.health(lambda entries: int(entries["messages"]) >= before + 2)
     assert health["refused"] == "1" and microphone.subscribed
@@ -411,7 +417,8 @@ def test_subscribers_get_data_of_any_length(graph: Graph) -> None:
     text.publish(String("x" * 1_000_000))
     with graph.start(PYTHON, "-c", LISTENING, "/long/audio", "/long/text", PYTHONPATH=python_path(graph)) as listener:
         wait_for(
-            lambda: sorted(listener.out.splitlines()) == ["audio 44100", "text 1000000"], 30, lambda: str(listener)
+            lambda: sorted(listener.out.splitlines()) == ["audio 44100", "text 1000000"],
+            what=lambda: str(listener),
         )
     audio.unregister()
     text.unregister()

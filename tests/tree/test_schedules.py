@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from collections.abc import Callable
@@ -343,25 +344,25 @@ def go(patch: pytest.MonkeyPatch, scenario: Scenario, count: int, delays: int, w
     return explore(run, partial(use, patch), delays, walks)
 
 
-scenarios = pytest.mark.parametrize(
-    ("scenario", "delays"),
-    [
-        (grow, 1),
-        (wake, 1),
-        (receive, 2),
-        (receive_until_stop, 2),
-        (without_consumers, 1),
-        (shrink, 2),
-        (remove_child, 2),
-        (replace_input, 1),
-        (stop, 2),
-        (fail, 2),
-    ],
+SCENARIOS = (
+    (grow, 1),
+    (wake, 1),
+    (receive, 2),
+    (receive_until_stop, 2),
+    (without_consumers, 1),
+    (shrink, 2),
+    (remove_child, 2),
+    (replace_input, 1),
+    (stop, 2),
+    (fail, 2),
 )
+SETTINGS = ((3, 0.0), (2, math.inf), (1, 0.0))  # workers, and when they publish blocks; one for each scenario
 
 
-@pytest.mark.parametrize(("count", "threshold"), [(1, 0.0), (2, math.inf), (3, 0.0)])
-@scenarios
+@pytest.mark.parametrize(
+    ("scenario", "delays", "count", "threshold"),
+    [(*scenario, *settings) for scenario, settings in zip(SCENARIOS, itertools.cycle(SETTINGS), strict=False)],
+)
 def test_any_order_of_events(
     scenario: Scenario, delays: int, count: int, threshold: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -373,7 +374,7 @@ def test_any_order_of_events(
 @pytest.mark.exploration
 @pytest.mark.parametrize("threshold", [0.0, math.inf])
 @pytest.mark.parametrize("count", [1, 2, 3])
-@scenarios
+@pytest.mark.parametrize(("scenario", "delays"), SCENARIOS)
 def test_any_order_of_events_in_all_combinations(
     scenario: Scenario, delays: int, count: int, threshold: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -301,7 +301,7 @@ ANOTHER_INPUT = {"root": "", "new": "", "a": "root"}
         (ANOTHER_INPUT, 1, 6_000),
         pytest.param(GRANDCHILD, 2, 14_000, marks=pytest.mark.long),
         pytest.param(SIBLINGS, 2, 50_000, marks=pytest.mark.exploration),
-        pytest.param({**SIBLINGS, "c": "a"}, 1, 30_000, marks=pytest.mark.long),
+        pytest.param({**SIBLINGS, "c": "a"}, 1, 30_000, marks=pytest.mark.exploration),
         pytest.param(ANOTHER_INPUT, 2, 150_000, marks=(pytest.mark.exploration, pytest.mark.timeout(900))),
     ],
 )
