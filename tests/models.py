@@ -14,7 +14,7 @@ from rosafe.localization.model_cache import model_of
 from tests import harness
 
 SOUND_SECONDS = {44100: 100.0}  # by sample rate; the accuracy of the demo's scene needs no more
-OTHER_SOUND_SECONDS = 250.0
+OTHER_SOUND_SECONDS = 120.0
 
 
 def cache(factory: pytest.TempPathFactory) -> Path:

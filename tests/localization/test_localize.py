@@ -223,10 +223,9 @@ def test_models_are_cached_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.undo()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(training, "SOUND_SECONDS", 20.0)
-    for damaged in (b"damaged", files[0].read_bytes()[: 10**5]):
-        files[0].write_bytes(damaged)
-        _equal(first, rosafe.localize(sound, 8000, rosafe.Head.sphere()))
-        assert files[0].stat().st_size > 10**6
+    files[0].write_bytes(files[0].read_bytes()[: 10**5])
+    _equal(first, rosafe.localize(sound, 8000, rosafe.Head.sphere()))
+    assert files[0].stat().st_size > 10**6
 
 
 def test_a_cache_that_cannot_be_written_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:

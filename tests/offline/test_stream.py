@@ -170,4 +170,4 @@ def test_no_threads_and_little_overhead() -> None:
             one.process(block)
             taken.append(time.perf_counter() - begun)
     assert threading.active_count() == before
-    assert np.median(seconds[stream]) < 2 * np.median(seconds[stages])  # 1.3 on a quiet machine
+    assert np.median(seconds[stream]) < 3 * np.median(seconds[stages])  # 1.3 on a quiet machine

@@ -49,7 +49,7 @@ def test_continuous_events_are_never_two_lines_at_a_time() -> None:
 
     wait_for(five_lines)
     gaps = [later - earlier for earlier, later in itertools.pairwise(times)]
-    assert min(gaps) > 0.1, gaps
+    assert min(gaps) > 0.01, gaps
 
 
 def test_a_kind_can_be_named_and_the_number_of_kinds_is_limited() -> None:

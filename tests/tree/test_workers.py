@@ -416,7 +416,7 @@ def test_a_long_computation_does_not_block_requests(
     assert tree.dependencies("other") == ["input", "other"]
     assert [(view.frames, index) for (view,), index, _ in [root.history.read_new("reader")]] in ([(0, 0)], [(1, 1)])
     assert tree.remove("long") == [long]
-    assert time.monotonic() - begun < PATIENCE / 4
+    assert time.monotonic() - begun < PATIENCE / 2
     listener.wait_blocks(other, 3)
     assert not long.join(0.0)
     go_on.set()
