@@ -24,11 +24,11 @@ def cache(factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def learn(factory: pytest.TempPathFactory, sample_rate: float) -> DirectionModel:
+def learn(factory: pytest.TempPathFactory, sample_rate: float, seconds: float | None = None) -> DirectionModel:
     """Return the model for a sample rate; the first process of a run that needs it learns it."""
     folder = cache(factory)
     with open(folder / "lock", "w") as lock, pytest.MonkeyPatch.context() as patch:
         fcntl.flock(lock, fcntl.LOCK_EX)
         patch.setenv("XDG_CACHE_HOME", str(folder))
-        patch.setattr(training, "SOUND_SECONDS", SOUND_SECONDS.get(round(sample_rate), OTHER_SOUND_SECONDS))
+        patch.setattr(training, "SOUND_SECONDS", seconds or SOUND_SECONDS.get(round(sample_rate), OTHER_SOUND_SECONDS))
         return model_of(Head.sphere(), sample_rate, None, lambda part: None)

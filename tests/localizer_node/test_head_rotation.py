@@ -185,6 +185,7 @@ sources:
 """
 
 
+@pytest.mark.exploration  # tests/localizer_node/test_node.py has another head that turns
 def test_the_node_follows_the_head(graph: Graph, kemar_model: Path, tmp_path: Path) -> None:
     import soundfile
     from rosAFE.msg import SoundSources

@@ -10,7 +10,7 @@ from tests.harness import Graph, Process, wait_for
 from tests.localizer_node.session import acquire, names_of, running_localizer, scene_file
 
 
-@pytest.mark.parametrize("also_the_localizer", [False, True])
+@pytest.mark.parametrize("also_the_localizer", [pytest.param(False, marks=pytest.mark.exploration), True])
 def test_restored_processors_are_removed_at_the_end(
     graph: Graph, bass: Process, talker: Path, sphere_model: Path, tmp_path: Path, also_the_localizer: bool
 ) -> None:

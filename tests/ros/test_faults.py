@@ -112,7 +112,7 @@ def test_cycles_of_creation_and_removal_leak_nothing(afe: Session) -> None:
     afe.read("preProc", BLOCK + 1)
     wait_for(lambda: afe.wait_activities(["InputProc", "PreProc"]))
     threads, memory = threads_and_memory(afe.process.pid)
-    for number in range(60):
+    for number in range(30):
         cycle(number)
     assert afe.processors() == {"input": ["input"], "preProc": ["preProc"]}
     wait_for(lambda: threads_and_memory(afe.process.pid)[0] <= threads + 2, what="threads end")
@@ -129,7 +129,7 @@ def test_random_requests_of_eight_clients(afe: Session) -> None:
 
     def work(number: int) -> None:
         chance = random.Random(number)
-        for _ in range(60):
+        for _ in range(30):
             name, other = chance.choice(names), chance.choice(names)
             parameter, value = chance.choice(changes)
             requests: list[tuple[str, dict[str, Any]]] = [

@@ -76,6 +76,7 @@ def test_a_second_client_in_one_process(graph: Graph, bass_node: Any) -> None:
         assert client.wait_for_server(rospy.Duration(PATIENCE))
 
 
+@pytest.mark.exploration  # compiles for several seconds
 def test_two_roscpp_clients_in_one_process(graph: Graph, bass_node: Any, tmp_path: Path) -> None:
     if not (GENERATOR.exists() and HEADER.exists() and shutil.which("g++")):
         pytest.skip("roscpp is not here: scripts/install --tests brings g++, gencpp and libactionlib-dev")
