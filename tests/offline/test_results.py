@@ -281,7 +281,7 @@ def vowel(frequency: float, formants: tuple[int, ...], rate: int) -> np.ndarray:
     return np.asarray(0.1 * sound / sound.std())
 
 
-@pytest.mark.parametrize("rate", [RATE, 44100])
+@pytest.mark.parametrize("rate", [RATE, pytest.param(44100, marks=pytest.mark.exploration)])
 def test_the_preset_for_speech_on_vowels(rate: int) -> None:
     errors: list[np.ndarray] = []
     for frequency in (80, 87, 100, 123, 150, 171, 200, 237, 300):
