@@ -315,7 +315,7 @@ def test_outputs_in_any_form() -> None:
 
 @pytest.mark.usefixtures("blocks_not_merged")
 def test_outputs_that_are_not_requested_are_not_stored() -> None:
-    """Twice the signal takes no more memory, except for a few frames of ILD."""
+    """Twice the signal takes no more memory, except for a few frames of ILD, and blocks that wait for a thread."""
 
     def peak(frames: int) -> int:
         signal = noise(frames)
@@ -328,7 +328,7 @@ def test_outputs_that_are_not_requested_are_not_stored() -> None:
 
     peak(2000)  # imports and caches
     gammatone_bytes = 2 * 4 * 8 * 40_000
-    assert peak(80_000) - peak(40_000) < 0.1 * gammatone_bytes
+    assert peak(80_000) - peak(40_000) < 0.3 * gammatone_bytes
 
 
 # --- changes on the way ---
