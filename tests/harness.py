@@ -28,6 +28,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, TypeVar
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -310,6 +311,8 @@ class Graph:
         master = rosgraph.Master(name, master_uri=self.uri)
         publishers, subscribers, services = master.getSystemState()
         address = master.lookupNode(name)
+        if _is_served(address):  # the node is alive: it would register again, and end its successor
+            return
         for topic, nodes in publishers:
             if name in nodes:
                 master.unregisterPublisher(topic, address)
@@ -372,6 +375,16 @@ class Graph:
             raise RuntimeError("rospy in this process belongs to the shared graph")
         if not rospy.core.is_initialized():
             rospy.init_node(f"test_{os.getpid()}", disable_signals=True)
+
+
+def _is_served(uri: str) -> bool:
+    """Return whether a server accepts connections at an address."""
+    parts = urlsplit(uri)
+    try:
+        socket.create_connection((parts.hostname or "", parts.port or 0), PATIENCE).close()
+    except OSError:
+        return False
+    return True
 
 
 def python_path(graph: Graph) -> str:
