@@ -121,7 +121,7 @@ def chunk_beyond_the_file(folder: Path) -> Path:
 
 def bz2_message(folder: Path) -> Path:
     plain = message(b"", 2**32 - 100)
-    packed = bz2.compress(plain + bytes(150_000_000))
+    packed = bz2.compress(plain + bytes(20_000_000))
     return bags.forge(folder / "a.bag", chunk(packed, 2**32 - 1, b"bz2"))
 
 

@@ -94,8 +94,17 @@ SAID = {
 }
 
 
+ALWAYS = ("enhance.py", "localize.py", "ratemap.py", "stream_microphones.py")  # the others only in long runs
+
+
 @pytest.mark.usefixtures("sphere")
-@pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.py")))
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in ALWAYS else pytest.param(name, marks=pytest.mark.exploration)
+        for name in sorted(path.name for path in EXAMPLES.glob("*.py"))
+    ],
+)
 def test_an_example(name: str, folder: Path, tmp_path: Path) -> None:
     if name == "features.py":
         pytest.importorskip("xarray", reason="xarray is not here: scripts/install --tests brings it")
