@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -67,6 +68,7 @@ NO_KERNELS = (  # tests of stages that have no kernel: the same code runs with k
     "representations/test_pitch.py",
     "representations/test_transients.py",
 )
+EACH_VARIANT = 4  # of the cases of a test, each fourth is repeated with numpy, or with kernels of an older processor
 ELSEWHERE = ("aarch64", "nehalem", "clang")  # kernels under qemu, or built by another compiler
 
 generate.ensure_messages()  # test modules import rosAFE.msg and bass.msg at their top
@@ -164,6 +166,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if _is_variant(item):
             item.add_marker("variant")
     _deselect_repetitions(items, config)
+    _mark_repetitions(items)
     slow = {item.path for item in items if item.get_closest_marker("ros") or item.get_closest_marker("long")}
     order = {harness.ROOT / "tests" / file: number - len(LONGEST_FILES) for number, file in enumerate(LONGEST_FILES)}
     items.sort(key=lambda item: order.get(item.path, int(item.path not in slow)))
@@ -199,3 +202,15 @@ def _deselect_repetitions(items: list[pytest.Item], config: pytest.Config) -> No
     kept = [item for item in items if not repeated(item)]
     config.hook.pytest_deselected(items=[item for item in items if repeated(item)])
     items[:] = kept
+
+
+def _mark_repetitions(items: list[pytest.Item]) -> None:
+    """Leave most cases of tests that repeat others to `scripts/test --long`: see `EACH_VARIANT`."""
+    numbers: Counter[tuple[str, str]] = Counter()
+    for item in items:
+        if item.get_closest_marker("variant") or _implementation(item) == "aarch64":
+            params = item.callspec.params  # type: ignore[attr-defined]
+            group = item.nodeid.partition("[")[0], str(_implementation(item) or params.get("implementation"))
+            if numbers[group] % EACH_VARIANT:
+                item.add_marker("exploration")
+            numbers[group] += 1

@@ -1,10 +1,12 @@
 """Built with sanitizers for addresses and undefined behaviour, the kernels pass their tests and process random blocks.
 
-The usual run has the kernels of one instruction set; `scripts/test --long` those of all, and more random blocks.
+The usual run has the kernels of one instruction set; `scripts/test --long` those of all, and more random blocks. They
+are beside the other kernels of this checkout, and remain for the next run.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import shutil
@@ -58,7 +60,7 @@ class Sanitized(NamedTuple):
     folder: Path
     levels: list[int]
 
-    def run(self, *arguments: str, examples: int = 6) -> subprocess.CompletedProcess[str]:
+    def run(self, *arguments: str, examples: int = 4) -> subprocess.CompletedProcess[str]:
         """Run tests.dsp.sanitized with these kernels; `examples` is the number of random ones of each test."""
         runtime = [_runtime(f"lib{name}.so") for name in ("asan", "ubsan")]
         environment = {
@@ -88,12 +90,15 @@ def _runtime(name: str) -> str:
     return found.stdout.strip()
 
 
-def _built(folder: Path, chosen: list[int]) -> Sanitized:
+def _built(chosen: list[int]) -> Sanitized:
     if shutil.which("gcc") is None or "/" not in _runtime("libasan.so") or "/" not in _runtime("libubsan.so"):
         pytest.skip("no gcc with sanitizers here")
-    compiler = folder / "compiler"
-    compiler.write_text(COMPILER, "ascii")
-    compiler.chmod(0o755)
+    folder = build.place() / f"sanitized-{hashlib.sha256(COMPILER.encode()).hexdigest()[:8]}"
+    folder.mkdir(mode=0o755, parents=True, exist_ok=True)
+    compiler, new = folder / "compiler", folder / f"compiler.{os.getpid()}"
+    new.write_text(COMPILER, "ascii")
+    new.chmod(0o755)
+    new.rename(compiler)
     names = build.ISA_LEVELS[platform.machine()]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(build.COMPILER, str(compiler))
@@ -104,19 +109,19 @@ def _built(folder: Path, chosen: list[int]) -> Sanitized:
 
 
 @pytest.fixture(scope="module")
-def newest(tmp_path_factory: pytest.TempPathFactory) -> Sanitized:
+def newest() -> Sanitized:
     """Kernels for the newest instruction set of this processor."""
     if not levels():
         pytest.skip("the kernels cannot be built here")
-    return _built(tmp_path_factory.mktemp("sanitized"), levels()[-1:])
+    return _built(levels()[-1:])
 
 
 @pytest.fixture(scope="module")
-def every(tmp_path_factory: pytest.TempPathFactory) -> Sanitized:
+def every() -> Sanitized:
     """Kernels for all instruction sets of this processor."""
     if not levels():
         pytest.skip("the kernels cannot be built here")
-    return _built(tmp_path_factory.mktemp("sanitized"), levels())
+    return _built(levels())
 
 
 def passed(done: subprocess.CompletedProcess[str]) -> None:
@@ -134,7 +139,7 @@ def test_kernels_pass_their_tests(newest: Sanitized) -> None:
 
 
 def test_random_blocks(newest: Sanitized) -> None:
-    passed(newest.run("fuzz", "400"))
+    passed(newest.run("fuzz", "200"))
 
 
 @pytest.mark.exploration

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -13,13 +14,15 @@ from pathlib import Path
 from tests.harness import PYTHON, ROOT
 
 UNPRIVILEGED_USER = 65534
+CLANG = ROOT / ".generated" / "cached-compilers" / "cached-clang"  # a program, see tests/packaging/conftest.py
 ENVIRONMENT = {"PATH": "/usr/local/bin:/usr/bin:/bin", "HOME": "/nonexistent"}
 EXCLUDED = shutil.ignore_patterns(
     ".git", ".generated", ".*_cache", ".hypothesis", "__pycache__", "tests", "rosafe-demo"
 )
 
 
-REQUESTS = ("InputProc", "IhcProc", "Stop")  # a service, and actions with and without a parent
+REQUESTS = ("InputProc", "IhcProc", "Stop", "Acquire")  # actions with and without a parent, services of both packages
+MESSAGES = ("rosAFE_signalOneD",)  # kept, with those that `REQUESTS` need
 
 
 @contextmanager
@@ -32,12 +35,24 @@ def fresh_copy() -> Iterator[Path]:
         yield copy
 
 
-def keep_few_requests(copy: Path) -> set[str]:
-    """Delete most requests of rosAFE, so that generators are quick; return the names of the deleted files."""
-    removed = {path for kind in ("action", "srv") for path in (copy / kind).iterdir() if path.stem not in REQUESTS}
-    for path in removed:
+def definitions(package: Path) -> set[Path]:
+    """Return the files of messages, services and actions in the folder of a ROS package."""
+    return {path for kind in ("action", "msg", "srv") for path in (package / kind).glob(f"*.{kind}")}
+
+
+def keep_few_definitions(copy: Path) -> None:
+    """Delete most requests and messages of both packages, so that generators are quick."""
+    both = definitions(copy) | definitions(copy / "bass")
+    kept = {path for path in both if path.stem in (*REQUESTS, *MESSAGES)}
+    while needed := {path for path in both - kept if any(path.stem in words(user) for user in kept)}:
+        kept |= needed
+    for path in both - kept:
         path.unlink()
-    return {path.name for path in removed}
+
+
+def words(definition: Path) -> set[str]:
+    """Return the words of a definition, which include the messages that it needs."""
+    return set(re.findall(r"\w+", definition.read_text("utf-8")))
 
 
 def environment(**more: str) -> dict[str, str]:

@@ -1,6 +1,6 @@
 """A catkin workspace with both packages: built, installed, and used from the install space only.
 
-Usually with a few requests of rosAFE: catkin starts several processes for each message. `scripts/test --long` has all.
+Usually with a few requests and messages: catkin starts several processes for each. `scripts/test --long` has all.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pytest
 from rosafe import __version__
 from rosafe.component import generate
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, wait_for
-from tests.packaging.clone import environment, fresh_copy, keep_few_requests, run
+from tests.packaging.clone import definitions, environment, fresh_copy, keep_few_definitions, run
 
 NEEDED = ("catkin_make", "cmake", "make", "cc")
 ALL = pytest.param("all", marks=pytest.mark.exploration)
@@ -32,7 +32,9 @@ def workspace(request: pytest.FixtureRequest) -> Iterator[Path]:
         pytest.skip(f"no catkin here ({missing or 'message_generation'}); run scripts/install --tests")
     with fresh_copy() as copy:
         if request.param == "few":
-            list_files(copy / "CMakeLists.txt", keep_few_requests(copy))
+            keep_few_definitions(copy)
+            list_definitions(copy)
+            list_definitions(copy / "bass")
         folder = copy.with_name("workspace")
         sources = folder / "src"
         sources.mkdir(parents=True)
@@ -51,17 +53,28 @@ def workspace(request: pytest.FixtureRequest) -> Iterator[Path]:
         yield folder
 
 
-def definitions(checkout: Path) -> set[str]:
-    """Return the names of the requests and actions of rosAFE in a checkout."""
-    return {path.stem for kind in ("action", "srv") for path in (checkout / kind).iterdir()}
+def names(package: Path) -> set[str]:
+    """Return the names of messages, services and actions in the folder of a ROS package."""
+    return {path.name for path in definitions(package)}
 
 
-def list_files(cmake: Path, removed: set[str]) -> None:
-    """Remove the names of deleted files from the lists in CMakeLists.txt."""
+def list_definitions(package: Path) -> None:
+    """Remove the names of deleted files from the lists in CMakeLists.txt, each of which was listed once."""
+    cmake = package / "CMakeLists.txt"
+    removed = names(ROOT / package.name if package.name == "bass" else ROOT) - names(package)
     lines = cmake.read_text("utf-8").splitlines(keepends=True)
     kept = [line for line in lines if line.strip() not in removed]
-    assert len(lines) - len(kept) == len(removed)
+    assert removed and len(lines) - len(kept) == len(removed)
     cmake.write_text("".join(kept), "utf-8")
+
+
+PARTS_OF_ACTIONS = ("Action", "Goal", "ActionGoal", "Result", "ActionResult", "Feedback", "ActionFeedback")
+
+
+def generated_from(name: str) -> set[tuple[str, str]]:
+    """Return the kind and name of the generated messages and services of a definition."""
+    stem, _, kind = name.partition(".")
+    return {("msg", stem + part) for part in PARTS_OF_ACTIONS} if kind == "action" else {(kind, stem)}
 
 
 def sourced(workspace: Path, commands: str, shell: str = "bash", **env: str) -> subprocess.CompletedProcess[str]:
@@ -80,16 +93,19 @@ def printed(done: subprocess.CompletedProcess[str]) -> str:
 def test_messages_equal_those_of_our_generator(workspace: Path, package: str) -> None:
     """Byte for byte, including the messages of actions."""
     generation = Path(generate.environment()["ROS_PACKAGE_PATH"].split(":")[0]).parent
-    deleted = tuple(definitions(ROOT) - definitions(workspace.with_name("gone"))) if package == "rosAFE" else ()
+    folder = "bass" if package == "bass" else "."
+    removed = names(ROOT / folder) - names(workspace.with_name("gone") / folder)
+    deleted = {made for name in removed for made in generated_from(name)}
     for kind in ("msg", "srv"):
         for own, catkin in (
             (generation / "python" / package / kind, workspace / "install/lib/python3/dist-packages" / package / kind),
             (generation / "share" / package / kind, workspace / "install/share" / package / kind),
         ):
-            expected = {p.name for p in own.iterdir() if p.is_file() and not p.name.lstrip("_").startswith(deleted)}
+            files = [p for p in own.iterdir() if p.is_file()]
+            expected = {p.name for p in files if (kind, p.stem.removeprefix("_")) not in deleted}
             assert {p.name for p in catkin.iterdir() if p.is_file()} == expected
-            names = sorted(expected - ({"__init__.py"} if deleted else set()))  # __init__.py imports the others
-            assert filecmp.cmpfiles(own, catkin, names, shallow=False) == (names, [], [])
+            same = sorted(expected - ({"__init__.py"} if deleted else set()))  # __init__.py imports the others
+            assert same and filecmp.cmpfiles(own, catkin, same, shallow=False) == (same, [], [])
 
 
 def test_python(workspace: Path) -> None:
@@ -111,13 +127,12 @@ def test_kernels(workspace: Path) -> None:
 @pytest.mark.parametrize("program", ["rosAFE-ros", "bass-ros"])
 def test_executables(workspace: Path, program: str) -> None:
     package = program.removesuffix("-ros")
-    for shell in ("bash", "dash"):
-        where = printed(sourced(workspace, f"command -v {program}", shell)).strip()
-        assert where == str(workspace / "install" / "bin" / program)
-    assert printed(sourced(workspace, f"{program} --version")) == f"{package} {__version__}\n"
-    assert printed(sourced(workspace, f"rosrun {package} {program} --version")) == f"{package} {__version__}\n"
+    where, version = str(workspace / "install" / "bin" / program), f"{package} {__version__}\n"
+    commands = f"command -v {program}; {program} --version; rosrun {package} {program} --version"
+    assert printed(sourced(workspace, commands)) == f"{where}\n{version}{version}"
+    assert printed(sourced(workspace, f"command -v {program}", "dash")).strip() == where
     unsourced = run(workspace / "install" / "bin" / program, "--version", env=environment())
-    assert printed(unsourced) == f"{package} {__version__}\n"
+    assert printed(unsourced) == version
 
 
 def test_ros_tools(workspace: Path) -> None:

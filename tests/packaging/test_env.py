@@ -7,12 +7,12 @@ import shlex
 import shutil
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from tests.harness import Graph
-from tests.packaging.clone import environment, fresh_copy, run
+from tests.packaging.clone import environment, fresh_copy, keep_few_definitions, run
 
 SHELLS = pytest.mark.parametrize("shell", ["bash", "dash", "zsh"])
 VARIABLES = (
@@ -24,7 +24,15 @@ SHOW = "; ".join(f'echo "${{{name}-unset}}"' for name in VARIABLES)
 
 @pytest.fixture(scope="module")
 def copy() -> Iterator[Path]:
+    with few_definitions() as path:
+        yield path
+
+
+@contextmanager
+def few_definitions() -> Iterator[Path]:
+    """Yield a copy of the checkout with few messages, which are generated quickly."""
     with fresh_copy() as path:
+        keep_few_definitions(path)
         yield path
 
 
@@ -97,7 +105,7 @@ def test_through_a_symbolic_link(copy: Path, shell: str, tmp_path: Path) -> None
 @SHELLS
 def test_surrounding_checkout_is_ignored(copy: Path, shell: str) -> None:
     """The sourced file determines the checkout, not the working directory."""
-    with fresh_copy() as other:
+    with few_definitions() as other:
         found = variables(sourced(shell, f"{source(copy)}; {SHOW}", cwd=other))
         assert found["PYTHONPATH"].startswith(f"{copy}/.generated/")
         assert not (other / ".generated").exists()
@@ -131,11 +139,17 @@ def test_defines_no_other_names(copy: Path, shell: str) -> None:
     assert done.stdout == "0\n"
 
 
+@pytest.fixture(scope="module")
+def broken() -> Iterator[Path]:
+    """A copy with a message that cannot be generated."""
+    with few_definitions() as path:
+        (path / "msg" / "rosAFE_signalOneD.msg").write_text("nonsense data\n")
+        yield path
+
+
 @SHELLS
-def test_failure_is_one_line_and_changes_nothing(shell: str) -> None:
-    with fresh_copy() as broken:
-        (broken / "msg" / "rosAFE_signalOneD.msg").write_text("nonsense data\n")
-        done = sourced(shell, f"{source(broken)}; echo $?; {SHOW}; set | grep -c '^_rosafe'")
+def test_failure_is_one_line_and_changes_nothing(broken: Path, shell: str) -> None:
+    done = sourced(shell, f"{source(broken)}; echo $?; {SHOW}; set | grep -c '^_rosafe'")
     assert done.stdout.splitlines() == ["1", environment()["PATH"], *["unset"] * (len(VARIABLES) - 1), "0"]
     assert done.stderr.startswith("rosafe: ") and done.stderr.count("\n") == 1
 
@@ -156,10 +170,9 @@ def test_dash_without_proc(copy: Path) -> None:
     assert "change into the checkout" in done.stderr and done.stderr.count("\n") == 1
 
 
-@SHELLS
-def test_commands_work_after_it(copy: Path, shell: str, graph: Graph) -> None:
-    env = environment(ROS_MASTER_URI=graph.uri, HOME=str(graph.home))
-    commands = "bass-ros --version && rosrun bass bass-ros --version && rosmsg show bass/binaudio_timestamp"
-    done = sourced(shell, f"{source(copy)} && {commands}", env=env)
+def test_commands_work_after_it(copy: Path, tmp_path: Path) -> None:
+    """In one shell: `test_sets_the_paths` compares the variables in all of them."""
+    commands = "bass-ros --version && rosrun bass bass-ros --version && rosmsg show rosAFE/rosAFE_signalOneD"
+    done = sourced("bash", f"{source(copy)} && {commands}", env=environment(HOME=str(tmp_path)))
     assert done.returncode == 0, done.stderr
-    assert "uint32 sec\nuint32 nsec\n" in done.stdout
+    assert done.stdout.count("bass ") == 2 and "float64[] data\n" in done.stdout

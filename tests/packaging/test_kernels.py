@@ -14,12 +14,12 @@ import pytest
 
 from rosafe.dsp.kernels import build, loader
 from tests.harness import PYTHON, run_together, wait_for
-from tests.packaging.clone import environment, fresh_copy, run, without_rights
+from tests.packaging.clone import CLANG, environment, fresh_copy, run, without_rights
 
-SHOW = (
-    "import numpy; from rosafe.dsp import kernels; from rosafe.representations.haircell import InnerHairCell as Ihc; "
-    "out = Ihc(44100, ihc_method='halfwave').process(-numpy.ones((2, 1, 900))); "  # does not import scipy.signal
-    "print(kernels.compiled(), kernels.status(), float(out[0, 0, 0]), sep='|')"
+SHOW = "from rosafe.dsp import kernels; print(kernels.compiled(), kernels.status(), sep='|')"
+PROCESS = (  # does not import scipy.signal
+    "import numpy; from rosafe.representations.haircell import InnerHairCell as Ihc; "
+    "assert not Ihc(44100, ihc_method='halfwave').process(-numpy.ones((2, 1, 900))).any(); "
 )
 
 pytestmark = pytest.mark.skipif(platform.machine() != "x86_64", reason="other processors have other libraries")
@@ -35,13 +35,12 @@ def shown(done: subprocess.CompletedProcess[str]) -> tuple[bool, str]:
     """Return whether a process running SHOW has used kernels, and its status."""
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    compiled, status, level = done.stdout.strip().split("|")
-    assert float(level) == 0.0
+    compiled, status = done.stdout.strip().split("|")
     return compiled == "True", status
 
 
-def show(copy: Path, **env: str) -> tuple[bool, str]:
-    return shown(run(PYTHON, "-c", SHOW, env=environment(PYTHONPATH=str(copy), **env)))
+def show(copy: Path, before: str = "", **env: str) -> tuple[bool, str]:
+    return shown(run(PYTHON, "-c", before + SHOW, env=environment(PYTHONPATH=str(copy), **env)))
 
 
 def folders(copy: Path) -> list[str]:
@@ -57,8 +56,8 @@ def compiler(copy: Path, body: str, name: str = "gcc") -> str:
     return f"{folder}:/usr/bin:/bin"
 
 
-def test_ten_concurrent_starts_in_a_new_tree(copy: Path) -> None:
-    results = set(run_together(10, lambda index: show(copy)))
+def test_concurrent_starts_in_a_new_tree(copy: Path) -> None:
+    results = set(run_together(5, lambda index: show(copy, PROCESS)))
     assert len(results) == 1
     compiled, status = results.pop()
     assert compiled
@@ -91,14 +90,14 @@ def test_script_builds_in_the_given_folder(copy: Path) -> None:
 def test_no_compiler(copy: Path) -> None:
     empty = copy.with_name("bin")
     empty.mkdir()
-    compiled, status = show(copy, PATH=str(empty))
+    compiled, status = show(copy, PROCESS, PATH=str(empty))
     assert not compiled
     assert status == ("numpy and scipy: the kernels are not built, and there is no compiler; install gcc")
     done = run(PYTHON, copy / "rosafe" / "dsp" / "kernels" / "build.py", env=environment(PATH=str(empty)))
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert show(copy)[0], "a compiler was installed"
-    assert show(copy, PATH=str(empty))[0], "built kernels need no compiler"
+    assert show(copy, PROCESS, PATH=str(empty))[0], "built kernels need no compiler"
 
 
 def test_compiler_fails(copy: Path) -> None:
@@ -213,10 +212,9 @@ def test_environment_variable(copy: Path) -> None:
 
 def test_selected_compiler(copy: Path) -> None:
     """It has a separate folder: the libraries of the other compiler remain."""
-    clang = shutil.which("clang")
-    if clang is None:
+    if shutil.which("clang") is None:
         pytest.skip("clang is not installed; run scripts/install --tests")
-    path = compiler(copy, f'exec {clang} "$@" -O0', "clang")  # in a third of the time
+    path = compiler(copy, f'exec "{CLANG}" "$@" -O0', "clang")  # in a third of the time
     assert "by clang " in show(copy, PATH=path, ROSAFE_COMPILER="clang")[1]
     assert "by gcc " in show(copy)[1]
     assert len(folders(copy)) == 2
