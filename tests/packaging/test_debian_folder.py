@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import shutil
+import subprocess
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from rosafe import missing
+from tests import fork_server, harness
 from tests.harness import PYTHON, ROOT
 from tests.packaging.clone import environment, run
 from tests.packaging.test_deb import assert_same_messages
@@ -42,11 +47,28 @@ def test_messages_equal_those_of_the_checkout(tmp_path: Path) -> None:
         assert not [path for path in (tmp_path / "share" / package).rglob("*") if path.is_symlink()]
 
 
-def test_manual_pages(tmp_path: Path) -> None:
-    """Each command has one, with its whole help, and rosafe with that of each subcommand."""
-    env = environment(PYTHONPATH=str(ROOT), SOURCE_DATE_EPOCH="1700000000")
-    done = run(PYTHON, "-m", "debian.manpages", tmp_path / "man", env=env, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
+def test_manual_pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each command has one, with its whole help, and rosafe with that of each subcommand.
+
+    The commands are forks of a process that has imported rosafe.
+    """
+
+    def forked(command: list[str], env: dict[str, str], **options: Any) -> subprocess.CompletedProcess[str]:
+        if command[0] != "scripts/rosafe":
+            return real_run(command, env=env, **options)
+        done = fork_server.shared().run([str(ROOT / command[0]), *command[1:]], env, None, "", harness.PATIENCE)
+        assert (done.returncode, done.stderr) == (0, "")
+        return done
+
+    spec = importlib.util.spec_from_file_location("manpages", ROOT / "debian" / "manpages.py")
+    assert spec and spec.loader
+    manpages = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(manpages)
+    real_run = subprocess.run
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    monkeypatch.setattr(manpages, "subprocess", SimpleNamespace(run=forked, PIPE=subprocess.PIPE))
+    manpages.main(tmp_path / "man")
     pages = {path.stem: path.read_text("utf-8") for path in (tmp_path / "man").iterdir()}
     installed = (ROOT / "debian" / f"{name}.manpages" for name in ("rosafe", "python3-rosafe"))
     assert {Path(line).stem for path in installed for line in path.read_text("utf-8").splitlines()} == set(pages)
