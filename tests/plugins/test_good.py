@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -123,13 +122,12 @@ def test_in_a_running_node(world: worlds.World, folder: Path) -> None:
 @pytest.mark.ros
 def test_all_interfaces(world: worlds.World) -> None:
     def shell(command: str) -> str:
-        return world.graph.run(*shlex.split(command)).stdout
+        return world.graph.run("bash", "-c", f". {ROOT}/scripts/env.sh && {command}").stdout
 
     changing = "rosservice call /rosAFE/modifyParameter \"{{nameProc: zc2, nameParam: zc_threshold, newValue: '{}'}}\""
 
     # one request for the whole chain, from the shell
-    request = f". {ROOT}/scripts/env.sh && rosafe request zeroCrossings zc_wSizeSec=0.05 fb_nChannels=4 --json"
-    reported = json.loads(world.graph.run("bash", "-c", request).stdout)
+    reported = json.loads(shell("rosafe request zeroCrossings zc_wSizeSec=0.05 fb_nChannels=4 --json"))
     assert reported["created"][-1] == "zeroCrossings_0"
     parent = reported["dependencies"][-2]
 
