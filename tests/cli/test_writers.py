@@ -55,7 +55,7 @@ def test_the_second_writer_is_refused_while_the_first_one_writes(tmp_path: Path,
     target.parent.mkdir()
     if replace:
         process(second, target)
-    refusals = []
+    refusals: list[str] = []
 
     def meanwhile(done: int, frames: int) -> None:
         if done in (0, frames) or not refusals:
