@@ -17,6 +17,8 @@ from rosafe.dsp.numeric_limits import FloatArray
 
 MAX_PIECES = 256  # blocks are joined if the window would otherwise consist of more pieces, or
 MIN_PIECE_BYTES = 4096  # if they are smaller than this
+BUFFER_PARTS = 8  # short blocks are joined in buffers of this part of the window,
+SMALL_BUFFER_BYTES = 65536  # or of the whole window up to this size: a short window consists of few pieces then
 
 
 def frames_in(seconds: float, rate: float) -> int:
@@ -78,7 +80,9 @@ class WindowView:
 
 
 class SlidingWindow:
-    """The newest `frames` frames of a signal. Each sample is copied at most once, when short blocks are joined.
+    """The newest `frames` frames of a signal.
+
+    Each sample is copied at most once: a short block, to the end of a buffer. What a view contains is not overwritten.
 
     Parameters
     ----------
@@ -93,25 +97,36 @@ class SlidingWindow:
         self.frames = frames
         self._pieces: list[FloatArray] = [self._zeros(0)]
         self._held = 0  # frames in all pieces; the window may begin within the first one
-        self._short = self._short_frames = 0  # blocks at the end that are not joined yet, and their frames
+        self._buffer: FloatArray = np.empty(0)  # for short blocks
+        self._start = self._stop = 0  # of its last piece, which ends at `_stop`; it is empty after a long block
 
     def append(self, block: FloatArray) -> None:
         """Append `block` of shape (*rows, n). It must not be modified afterwards."""
         count, pieces = block.shape[-1], self._pieces
         if count == 0:
             return
-        pieces.append(block)
+        if block.nbytes >= MIN_PIECE_BYTES and count * MAX_PIECES >= self.frames:
+            pieces.append(block)
+            self._start = self._stop
+        else:
+            self._append_copy(block, count)
         self._held += count
         while len(pieces) > 1 and self._held - pieces[0].shape[-1] >= self.frames:
             self._held -= pieces.pop(0).shape[-1]
-        if block.nbytes >= MIN_PIECE_BYTES and count * MAX_PIECES >= self.frames:
-            self._short = self._short_frames = 0
-            return
-        self._short = min(self._short + 1, len(pieces))
-        self._short_frames += count
-        if self._short_frames**2 >= self.frames * count:  # balances the number of joined and of short pieces
-            pieces[-self._short :] = [np.concatenate(pieces[-self._short :], axis=-1)]
-            self._short = self._short_frames = 0
+
+    def _append_copy(self, block: FloatArray, count: int) -> None:
+        """Append a block by a copy, to the last piece if that is in the buffer."""
+        start, at = self._start, self._stop
+        if at + count > self._buffer.shape[-1]:
+            small = SMALL_BUFFER_BYTES * count // block.nbytes
+            capacity = max(count, self.frames // BUFFER_PARTS, min(self.frames, small))
+            self._buffer = np.empty((*self.rows, capacity), block.dtype)
+            start = at = 0
+        self._buffer[..., at : at + count] = block
+        if at > start:
+            self._pieces.pop()
+        self._start, self._stop = start, at + count
+        self._pieces.append(self._buffer[..., start : at + count])
 
     def view(self, frames: int | None = None) -> WindowView:
         """Return the newest `frames` frames, newest last; by default, and at most, those that have arrived."""
