@@ -168,9 +168,9 @@ class Workers:
         """Add a ready task. A caller that is not a worker calls `wake` afterwards."""
         heapq.heappush(self._ready, (-task.depth, next(self._sequence), task))
 
-    def wake(self) -> None:
-        """Notify an idle worker, or start one, for each waiting task, within the free slots."""
-        for _ in range(min(len(self._ready), self._free_slots) - self._woken):
+    def wake(self, limit: int = MAX_WORKERS) -> None:
+        """Notify an idle worker, or start one, for each waiting task, within the free slots and `limit`."""
+        for _ in range(min(len(self._ready), self._free_slots, limit) - self._woken):
             if self._idle:
                 self._notify_idle()
                 continue
@@ -199,7 +199,15 @@ class Workers:
             self._release_slot(me)
             if self._ready:  # handing tasks over costs more than leaving all to the workers
                 me.refusals = REFUSED_RUNS
-        self.wake()
+        self._wake_if_needed()
+
+    def _wake_if_needed(self) -> None:
+        """Wake workers for the ready tasks; in real time one, or another one only if the tasks take long."""
+        computing = next((worker.task for worker in self._workers if worker.has_slot and worker.task), None)
+        if not self.real_time or (computing is not None and self._should_wake_another(computing)):
+            self.wake()
+        elif computing is None and not self._woken:
+            self.wake(1)
 
     def _pop_short_task(self) -> Task | None:
         """Return the deepest ready task if it is trusted and short."""

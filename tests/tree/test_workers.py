@@ -251,6 +251,34 @@ def test_the_calling_thread_runs_nothing_while_a_worker_computes_or_offline() ->
             workers._free_slots += real_time
 
 
+@pytest.mark.parametrize(
+    ("computing", "seconds", "woken"),
+    [
+        ([], [2e-3], 1),
+        ([], [2e-3, 2e-3], 1),  # the worker wakes another one if necessary
+        ([5e-3], [2e-3, 2e-3], 0),
+        ([5e-3], [2e-2], 1),
+        ([2.1e-2], [2e-3], 1),
+    ],
+)
+def test_arriving_sound_wakes_a_second_worker_only_for_long_tasks(
+    computing: list[float], seconds: list[float], woken: int
+) -> None:
+    lock = threading.RLock()
+    workers = pool.Workers(lock, 2, real_time=True)
+    workers._busy_since = math.inf  # the tree keeps up
+    workers._workers = [pool._Worker(lock) for _ in range(2)]
+    workers._idle = workers._workers[len(computing) :]
+    workers._free_slots -= len(computing)
+    for worker, duration in zip(workers._workers, computing, strict=False):
+        worker.has_slot, worker.task = True, EstimatedTask(duration)
+    with lock:
+        for duration in seconds:
+            workers.push(EstimatedTask(duration))
+        workers.run_short_tasks()
+    assert workers._woken == woken
+
+
 def test_the_pool_is_busy_only_until_all_workers_are_idle() -> None:
     """The next tasks are run by the worker that worked last."""
 
