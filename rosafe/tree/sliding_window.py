@@ -82,7 +82,7 @@ class WindowView:
 class SlidingWindow:
     """The newest `frames` frames of a signal.
 
-    Each sample is copied at most once: a short block, to the end of a buffer. What a view contains is not overwritten.
+    Each sample is copied at most once: a short block, to the end of a buffer. The content of a view is never overwritten.
 
     Parameters
     ----------
