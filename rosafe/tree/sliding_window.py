@@ -82,7 +82,7 @@ class WindowView:
 class SlidingWindow:
     """The newest `frames` frames of a signal.
 
-    Each sample is copied at most once: a short block, to the end of a buffer. The content of a view is never overwritten.
+    Each sample is copied at most once: a short block, to the end of a buffer. No view is overwritten later.
 
     Parameters
     ----------
