@@ -41,8 +41,9 @@ log = logging.getLogger("rosout.rosafe_live")  # stderr and /rosout, as rospy.lo
 class _Socket(web.WebSocketResponse):
     """A WebSocket that gives a reason also if aiohttp closes it."""
 
-    async def close(self, *, code: int = WSCloseCode.OK, message: bytes = b"") -> bool:
-        return await super().close(code=code, message=message or REASONS.get(code, b""))
+    async def close(self, *, code: int = WSCloseCode.OK, message: bytes = b"", **options: Any) -> bool:
+        """Close it; newer versions of aiohttp have further options."""
+        return await super().close(code=code, message=message or REASONS.get(code, b""), **options)
 
 
 class BrowserConnection:

@@ -15,7 +15,7 @@ import pytest
 
 from rosafe import interface
 from rosafe.genomix import binary_format
-from tests.harness import ROOT
+from tests.harness import ROOT, proc
 
 LONG = int(os.environ.get("DECODE_FUZZ", "0"))  # number of additional rounds, for example DECODE_FUZZ=100000
 SIZES = (1, 2, 255, 65_536, 1_000_000, 2**24, 2**30, 2**31 - 1, 2**31, 2**32 - 8, 2**32 - 1)
@@ -153,6 +153,7 @@ def decoded(folder: Path, answers: list[bytes]) -> tuple[list[str], float, float
     """Return Octave's result for each, as cells and matrices (``good`` or the error), maximum time (s), memory (MB)."""
     if shutil.which("octave-cli") is None:
         pytest.skip("octave-cli is not installed; scripts/install --tests brings it")
+    proc("self", "status")  # the script reads it
     with (folder / "documents").open("wb") as out:
         for number, answer in enumerate(answers):
             out.write(struct.pack("<II", len(answer), 1 + number % 2) + answer)

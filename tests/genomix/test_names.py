@@ -125,6 +125,10 @@ def nameless(graph: Graph) -> Iterator[int]:
 
 def test_clients_get_the_error_immediately(graph: Graph, nameless: int, tmp_path: Path) -> None:
     name = socket.gethostname()
+    try:
+        socket.getaddrinfo(name, nameless)
+    except OSError:
+        pytest.skip(f"the name of this machine, {name}, has no address here")
     script = tmp_path / "script.tcl"
     script.write_text(f"package require genomix\nputs [catch {{genomix::connect {name}:{nameless}}} told]$told")
     output = graph.run("tclsh", str(script)).stdout

@@ -12,7 +12,7 @@ from selenium import webdriver
 from selenium.webdriver.chrome.options import Options
 from selenium.webdriver.chrome.service import Service
 
-from tests.harness import wait_for
+from tests.harness import proc, wait_for
 
 ARGUMENTS = (
     "--headless=new",
@@ -64,6 +64,7 @@ class Browser:
 def browser(downloads: Path | None = None) -> Iterator[Browser]:
     """Start a browser with a temporary profile; files are saved to `downloads`."""
     options = Options()
+    proc("self")  # Chromium does not start without it
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         for argument in (*ARGUMENTS, f"--user-data-dir={folder}"):
             options.add_argument(argument)
