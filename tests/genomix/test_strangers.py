@@ -39,7 +39,9 @@ class Stranger:
                 return
             with connection, contextlib.suppress(OSError):
                 connection.settimeout(30)
-                connection.recv(65536)
+                request = b""
+                while not request.endswith(b"\r\n\r\n") and (new := connection.recv(65536)):
+                    request += new  # closing with unread data would discard the answer
                 connection.sendall(self._answer)
                 block = self._endless * (65536 // max(1, len(self._endless)))
                 while block and self.swallowed < ENDLESS:

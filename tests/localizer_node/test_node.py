@@ -153,7 +153,7 @@ def test_offline_and_live_agree(
     import rosAFE.msg
 
     model = tmp_path / "sphere.head"
-    models.learn(tmp_path_factory, rate, models.SOUND_SECONDS if rate == RATE else 40.0).save(model)
+    models.learn(tmp_path_factory, rate, None if rate == RATE else 40.0).save(model)
     silence, sound = np.zeros((20 * block, 2), np.int32), two_talkers(6.0, rate)
     for name, samples in (("silence", silence), ("sound", sound)):
         soundfile.write(tmp_path / f"{name}.wav", samples, rate, subtype="PCM_32")
