@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 import subprocess
 from collections import Counter
@@ -69,6 +70,22 @@ NO_KERNELS = (  # tests of stages that have no kernel: the same code runs with k
     "representations/test_transients.py",
 )
 EACH_VARIANT = 4  # of the cases of a test, each fourth is repeated with numpy, or with kernels of an older processor
+EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal suite, the others with scripts/test --long
+    "dsp/test_processors.py::test_every_kernel": 3,
+    "genomix/test_guide.py::test_usage_patterns_of_published_scripts": 2,
+    "genomix/test_trouble.py::test_known_components_continue_without_a_master": 2,
+    "localizer_node/test_attacks.py::test_frames_with_strange_values_and_indices": 2,
+    "localizer_node/test_ear_check.py::test_the_command": 2,
+    "localizer_node/test_node.py::test_offline_and_live_agree": 2,
+    "matlab/test_original_folder.py::test_a_client_script_in_the_original_folder": 2,
+    "packaging/test_catkin.py::test_messages_equal_those_of_our_generator": 2,
+    "plugins/test_documents.py::test_examples": 2,
+    "plugins/test_versions.py::test_a_client_with_another_plugin": 2,
+    "setups/test_parsing_time.py::test_time_is_bounded": 4,
+    "setups/test_parsing_time.py::test_time_is_linear": 5,
+    "tree/test_schedules.py::test_any_order_of_events": 2,
+    "view/test_plot.py::test_silent_and_very_short_signals": 3,
+}
 ELSEWHERE = ("aarch64", "nehalem", "clang")  # kernels under qemu, or built by another compiler
 
 generate.ensure_messages()  # test modules import rosAFE.msg and bass.msg at their top
@@ -172,6 +189,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items.sort(key=lambda item: order.get(item.path, int(item.path not in slow)))
 
 
+def pytest_collection_finish() -> None:
+    """Leave the collected tests out of garbage collections, which would examine them again and again."""
+    gc.collect()
+    gc.freeze()
+
+
 def _implementation(item: pytest.Item) -> Choice | None:
     """Return the implementation that a test selects by its argument `level`; levels of sound are floats."""
     level = item.callspec.params.get("level") if hasattr(item, "callspec") else None
@@ -205,12 +228,14 @@ def _deselect_repetitions(items: list[pytest.Item], config: pytest.Config) -> No
 
 
 def _mark_repetitions(items: list[pytest.Item]) -> None:
-    """Leave most cases of tests that repeat others to `scripts/test --long`: see `EACH_VARIANT`."""
+    """Leave most cases of some tests to `scripts/test --long`: see `EACH_VARIANT` and `EACH_CASE`."""
     numbers: Counter[tuple[str, str]] = Counter()
     for item in items:
+        test, variant = item.nodeid.partition("[")[0].removeprefix("tests/"), ""
+        each = EACH_CASE.get(test, 1)
         if item.get_closest_marker("variant") or _implementation(item) == "aarch64":
             params = item.callspec.params  # type: ignore[attr-defined]
-            group = item.nodeid.partition("[")[0], str(_implementation(item) or params.get("implementation"))
-            if numbers[group] % EACH_VARIANT:
-                item.add_marker("exploration")
-            numbers[group] += 1
+            variant, each = str(_implementation(item) or params.get("implementation")), EACH_VARIANT
+        if numbers[test, variant] % each:
+            item.add_marker("exploration")
+        numbers[test, variant] += 1

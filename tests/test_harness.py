@@ -12,7 +12,7 @@ import pytest
 import rospy
 from std_msgs.msg import Empty
 
-from tests import fork_server, harness
+from tests import conftest, fork_server, harness
 from tests.harness import PYTHON, ROOT, Graph, Process, proc
 from tests.terminal import Terminal
 
@@ -113,3 +113,11 @@ def test_programs_whose_imports_may_differ_are_not_forked(tmp_path: Path) -> Non
         (["cat"], {}),
     ):
         assert not harness.can_fork(command, {**env, **changes}), (command, changes)
+
+
+def test_the_lists_of_conftest_name_existing_tests() -> None:
+    for name in (*conftest.STARTING_FILES, *conftest.LONG_FILES, *conftest.LONGEST_FILES, *conftest.NO_KERNELS):
+        assert (ROOT / "tests" / name).exists(), name
+    for name in conftest.EACH_CASE:
+        file, _, test = name.partition("::")
+        assert f"def {test}(" in (ROOT / "tests" / file).read_text("utf-8"), name

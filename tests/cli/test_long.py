@@ -210,6 +210,7 @@ def test_few_lines_without_a_terminal(tmp_path: Path) -> None:
     assert done.stderr.count("\n") <= 3
 
 
+@pytest.mark.exploration
 def test_the_reader_of_messages_ends(long_file: Path) -> None:
     """`rosafe process ... 2>&1 | head`: no traceback and no leftovers."""
     read, write_end = os.pipe()

@@ -91,6 +91,7 @@ def test_running_processes_are_kept(tmp_path: Path) -> None:
         master.kill()
 
 
+@pytest.mark.exploration
 def test_the_localizer_of_a_setup(alone: Graph, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     """It gets the settings of the setup, and uses its input. The device and the file for the head are also options."""
     head = tmp_path / "robot.head"

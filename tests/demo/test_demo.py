@@ -27,6 +27,7 @@ def finished(running: Demo) -> str:
     return running.out
 
 
+@pytest.mark.exploration
 def test_speech_without_home(tmp_path: Path, learn: Learn) -> None:
     """The shared speech is on the right until its end, except a rest that is shorter than a block.
 
@@ -73,6 +74,7 @@ def test_telephone_quality_until_ctrl_c(tmp_path: Path, learn: Learn) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.exploration
 def test_a_closed_output_pipe_ends_the_demo(tmp_path: Path, learn: Learn) -> None:
     """It is started through a symbolic link. When the reader of its output ends, all its processes end."""
     learn(SCENE_RATE)

@@ -115,6 +115,7 @@ def walk(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.exploration
 def test_the_plots_are_the_same_after_all_processes_were_killed(walk: Path, tmp_path: Path) -> None:
     graph = Graph(f"http://127.0.0.1:{free_port()}", tmp_path)
     setup = tmp_path / "setup.yaml"

@@ -314,7 +314,8 @@ def test_files_that_block(graph: Graph, tmp_path: Path) -> None:
 def test_a_noise_level_that_cannot_be_written(graph: Graph, talking: Localizer, sphere_model: Path) -> None:
     """The command says so; the processors that the localizer uses remain."""
     before = names_of(graph)
-    for path in (f"{sphere_model}/noise.json", "/dev/full"):
+    special = ["/proc/noise.json"] if Path("/proc/self").exists() else []  # in a bare chroot it is a usual folder
+    for path in (*special, "/dev/full"):
         command = ("rosafe", "localize", "--calibrate-noise", "0.5", "--noise", path, "--head", str(sphere_model))
         done = graph.run(*command, check=False)
         assert done.returncode != 0 and path in done.stderr and "Traceback" not in done.stderr, done.stderr

@@ -5,6 +5,8 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
+import pytest
+
 from tests.harness import Graph, free_port, wait_for
 from tests.localizer_node.conftest import RATE
 from tests.localizer_node.session import watched, watcher
@@ -17,6 +19,7 @@ processors:
 """
 
 
+@pytest.mark.exploration
 def test_roslaunch_localizes(tmp_path: Path, talker: Path, sphere_model: Path) -> None:
     graph = Graph(f"http://127.0.0.1:{free_port()}", tmp_path)
     scene, setup = tmp_path / "scene.yaml", tmp_path / "tree.yaml"

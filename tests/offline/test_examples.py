@@ -68,6 +68,7 @@ def is_picture(path: Path) -> bool:
     return path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 20_000
 
 
+@pytest.mark.exploration
 @pytest.mark.usefixtures("sphere")
 def test_the_tutorial(folder: Path) -> None:
     pytest.importorskip("xarray", reason="xarray is not here: scripts/install --tests brings it")

@@ -47,6 +47,7 @@ def test_busy_machine_is_rejected() -> None:
         assert re.fullmatch(rf"{name}\.py: the load is 0\.51, above 0\.5: .*--loaded", line)
 
 
+@pytest.mark.exploration
 def test_load_is_printed_first(tmp_path: Path) -> None:
     """Both in the output and in the file. The run is short, with few trees."""
     short = ("--most", 1, "--trial", 1.5, "--seconds", 1.5, "--processes", 1, "--results", tmp_path)

@@ -14,6 +14,7 @@ from rosafe.interface import KINDS
 from tests.harness import PYTHON, ROOT
 
 
+@pytest.mark.exploration
 def test_sphinx_reports_nothing(tmp_path: Path) -> None:
     for module in ("sphinx", "numpydoc", "myst_parser"):
         pytest.importorskip(module, reason=f"{module} is not installed; run scripts/install --tests")

@@ -56,6 +56,7 @@ def compiler(copy: Path, body: str, name: str = "gcc") -> str:
     return f"{folder}:/usr/bin:/bin"
 
 
+@pytest.mark.exploration
 def test_concurrent_starts_in_a_new_tree(copy: Path) -> None:
     results = set(run_together(5, lambda index: show(copy, PROCESS)))
     assert len(results) == 1

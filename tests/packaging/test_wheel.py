@@ -121,6 +121,7 @@ def test_version_is_defined_once() -> None:
     assert VERSION not in (ROOT / "pyproject.toml").read_text("utf-8")
 
 
+@pytest.mark.exploration
 def test_library_tests_in_the_environment(venv: Venv, tmp_path: Path) -> None:
     """A part of this suite without a checkout: arguments and the reference numbers."""
     (tmp_path / "tests").mkdir()

@@ -119,6 +119,7 @@ def test_in_a_running_node(world: worlds.World, folder: Path) -> None:
     world.http.call("rosAFE/Stop")
 
 
+@pytest.mark.exploration
 @pytest.mark.ros
 def test_all_interfaces(world: worlds.World) -> None:
     def shell(command: str) -> str:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from .support import SHORT, python
 
 PLUGINS = Path(__file__).with_name("plugins_0_2")
 
 
+@pytest.mark.exploration
 def test_members_that_the_tree_uses() -> None:
     code = """
 from rosafe.representations import PROBLEMS, STAGES
