@@ -70,7 +70,7 @@ NO_KERNELS = (  # tests of stages that have no kernel: the same code runs with k
     "representations/test_transients.py",
 )
 EACH_VARIANT = 4  # of the cases of a test, each fourth is repeated with numpy, or with kernels of an older processor
-EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal suite, the others with scripts/test --long
+EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal suite; all with scripts/test --long
     "dsp/test_processors.py::test_every_kernel": 3,
     "genomix/test_guide.py::test_usage_patterns_of_published_scripts": 2,
     "genomix/test_trouble.py::test_known_components_continue_without_a_master": 2,
