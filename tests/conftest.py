@@ -71,6 +71,8 @@ NO_KERNELS = (  # tests of stages that have no kernel: the same code runs with k
 )
 EACH_VARIANT = 4  # of the cases of a test, each fourth is repeated with numpy, or with kernels of an older processor
 EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal suite; all with scripts/test --long
+    "cli/test_writers.py::test_many_concurrent_writers": 2,
+    "dsp/test_kernels.py::test_autocorrelation": 2,
     "dsp/test_processors.py::test_every_kernel": 3,
     "genomix/test_guide.py::test_usage_patterns_of_published_scripts": 2,
     "genomix/test_trouble.py::test_known_components_continue_without_a_master": 2,
@@ -78,6 +80,8 @@ EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal s
     "localizer_node/test_ear_check.py::test_the_command": 2,
     "localizer_node/test_node.py::test_offline_and_live_agree": 2,
     "matlab/test_original_folder.py::test_a_client_script_in_the_original_folder": 2,
+    "offline/test_examples.py::test_an_example": 2,
+    "packaging/test_catkin.py::test_executables": 2,
     "packaging/test_catkin.py::test_messages_equal_those_of_our_generator": 2,
     "plugins/test_documents.py::test_examples": 2,
     "plugins/test_versions.py::test_a_client_with_another_plugin": 2,

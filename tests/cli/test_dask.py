@@ -73,13 +73,8 @@ def test_no_scheduler(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    "restarts",
-    [
-        pytest.param(True, id="restarted by Dask"),
-        pytest.param(False, id="not restarted by Dask", marks=pytest.mark.exploration),
-    ],
-)
+@pytest.mark.exploration
+@pytest.mark.parametrize("restarts", [True, False], ids=["restarted by Dask", "not restarted by Dask"])
 def test_workers_that_die_at_their_start_end_the_run(tmp_path: Path, restarts: bool) -> None:
     """The parameter is False for later versions of Dask, which do not restart workers."""
     corpus(tmp_path / "corpus", 2)

@@ -46,6 +46,7 @@ def test_device(pulse: PulseServer, tmp_path: Path, learn: Learn) -> None:
         assert np.median(azimuths[:, 1]) > 10  # degrees; left is positive
 
 
+@pytest.mark.exploration
 def test_unplugged(pulse: PulseServer, tmp_path: Path, learn: Learn) -> None:
     """The direction is shown while noise from the left is recorded.
 

@@ -57,6 +57,7 @@ def test_the_page_of_the_request(world: World) -> None:
     assert world.lines(f"set env(GENOMIXD) $address\n{tcl}") == ["/rosAFE/ildPort/ild_1", "16"]
 
 
+@pytest.mark.exploration
 def test_the_page_of_the_representations(world: World) -> None:
     page = (harness.ROOT / "docs" / "representations.md").read_text("utf-8")
     (shell,) = re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)

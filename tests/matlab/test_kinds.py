@@ -251,6 +251,7 @@ SCRIPT = """
 """
 
 
+@pytest.mark.exploration
 def test_names_and_parameters_of_the_matlab_front_end(world: World, sound: Path) -> None:
     results = octave.run_and_parse(world, begin(sound) + SCRIPT)
     assert results["features"] == ["flux", "centroid"]

@@ -66,6 +66,7 @@ for kind in {kinds}:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.exploration
 def test_each_plugin_passes_the_check(folder: Path) -> None:
     check(folder, "zeroCrossings", "bands", "slowRatemap")
 
