@@ -26,6 +26,7 @@ STARTING_FILES = (  # the same for single files
     "eltclsh/test_terminal.py",
     "genomix/test_decode.py",
     "genomix/test_front_end.py",
+    "localizer_node/test_recovery.py",
     "offline/test_damaged.py",
     "offline/test_examples.py",
     "plugins/test_documents.py",
@@ -33,10 +34,12 @@ STARTING_FILES = (  # the same for single files
     "plugins/test_loading.py",
     "plugins/test_old_names.py",
     "plugins/test_plugins.py",
+    "test_harness.py",
 )
 LONG_FILES = (  # dozens of seconds of computation; scripts/test --fast has others for the same code
     "dsp/test_accuracy.py",
     "dsp/test_processors.py",
+    "localization/test_audio_delay.py",
     "localization/test_commands.py",
     "localization/test_enhancement.py",
     "localization/test_localize.py",
@@ -46,6 +49,9 @@ LONG_FILES = (  # dozens of seconds of computation; scripts/test --fast has othe
     "offline/test_resynthesis.py",
     "localization/test_tracker.py",
     "localizer_node/test_calibration.py",
+    "localizer_node/test_long_silence.py",
+    "offline/test_stream.py",
+    "validation/test_validate.py",
     "view/test_figure.py",
     "view/test_plot.py",
 )
