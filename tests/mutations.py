@@ -695,6 +695,13 @@ MUTATIONS = (
     ),
     # --- tree
     _tree(
+        "estimate-contains-waiting",
+        "processor.py",
+        "needed = used if self.trusted else seconds",
+        "needed = seconds",
+        "tests/tree/test_workers.py -k estimated",
+    ),
+    _tree(
         "released-while-read",
         "states.py",
         "            if self._readers:\n",

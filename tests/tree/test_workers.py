@@ -363,6 +363,23 @@ def test_the_estimated_duration_of_a_processor(tree: Tree, feed: Feed, listener:
         assert 0 < one.estimated_seconds <= ESTIMATE_GROWTH * before
 
 
+def test_the_estimated_duration_contains_no_waiting(
+    tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A task that waited for the interpreter's lock would be left to the workers, which wait even more."""
+    waited = 0.2  # s
+
+    class Waiting(Plain):
+        work = staticmethod(lambda block: threading.Event().wait(waited))
+
+    use_plain_stages(monkeypatch, preProc=Waiting)
+    tree.add_input("input", feed, 1, 1.0, 1.0)
+    one = tree.add("preProc", "preProc", "input")
+    feed.put(count=1)
+    listener.wait_blocks(one, 1)
+    assert one.estimated_seconds < waited / 2
+
+
 # --- blocked workers ---
 
 
