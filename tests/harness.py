@@ -23,6 +23,7 @@ import sys
 import tempfile
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -123,6 +124,7 @@ class Process:
         self.command = command
         self._out: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  # open as long as this object
         self._err: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
+        weakref.finalize(self, _close, self._out, self._err)  # readable as long as this object
         self._popen = self._start(command, env, cwd, fork and can_fork(command, env))
         self.pid = self._popen.pid
 
@@ -204,6 +206,11 @@ class Process:
         self.close()
         if error is not None:
             print(self)  # pytest shows this with the failure
+
+
+def _close(*streams: IO[bytes]) -> None:
+    for stream in streams:
+        stream.close()
 
 
 def _contents(stream: IO[bytes]) -> str:

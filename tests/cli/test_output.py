@@ -21,7 +21,7 @@ from rosafe.output import AtomicOutput, OutputError, new_file
 from tests.bass import bags
 from tests.cli import forked
 from tests.cli.command import refused, rosafe, start
-from tests.harness import Process, wait_for
+from tests.harness import Process, proc, wait_for
 
 RATE = 8000
 SCENE = ("--device", "scene:", "--rate", str(RATE), "--chunk", "400")
@@ -49,6 +49,7 @@ def content(folder: Path) -> dict[str, str]:
 
 @pytest.mark.parametrize(("name", "force"), [("a.wav", ()), ("a.bag", ("--force",))])
 def test_the_second_recorder_names_the_first_one(tmp_path: Path, name: str, force: tuple[str, ...]) -> None:
+    proc("self")  # without it, the other process has no number
     path = tmp_path / name
     if force:
         path.write_text("old recording")
@@ -69,6 +70,7 @@ def test_the_second_recorder_names_the_first_one(tmp_path: Path, name: str, forc
 
 @pytest.mark.parametrize("force", [(), ("--force",)], ids=["", "force"])
 def test_many_at_the_same_time(tmp_path: Path, force: tuple[str, ...]) -> None:
+    proc("self")
     commands = [
         ("record", "a.wav", "--device", f"scene:?seconds={walk}", *SCENE[2:], "--seconds", "1") for walk in range(2, 5)
     ]

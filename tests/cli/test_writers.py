@@ -16,7 +16,7 @@ from tests.cli import forked
 from tests.cli.command import SMALL, SMALL_PARAMETERS, as_int32, noise, refused, write
 from tests.cli.command import rosafe as command
 from tests.cli.forked import process
-from tests.harness import PYTHON, ROOT, SCRIPTS
+from tests.harness import PYTHON, ROOT, SCRIPTS, proc
 
 EXTENSIONS = [".npz", ".h5", ".mat", ".zarr", ".csv"]
 
@@ -50,6 +50,7 @@ def sounds(folder: Path, count: int) -> tuple[list[Path], list[np.ndarray]]:
     [(".npz", True), (".h5", False), (".mat", True), (".zarr", False), (".zarr", True), (".csv", False)],
 )
 def test_the_second_writer_is_refused_while_the_first_one_writes(tmp_path: Path, extension: str, replace: bool) -> None:
+    proc("self")  # without it, the other process has no number
     (first, second), (expected, _) = sounds(tmp_path, 2)
     target = tmp_path / "out" / f"a{extension}"
     target.parent.mkdir()

@@ -204,7 +204,7 @@ def test_environment_variable(copy: Path) -> None:
     for level in (2, 3):
         compiled, status = show(copy, ROSAFE_KERNELS=str(level))
         assert compiled
-        assert status.startswith(f"compiled for x86-64-v{level} by gcc 12")
+        assert status.startswith(f"compiled for x86-64-v{level} by gcc ")
         assert status.endswith(f"x86-64-v{level}.so")
     compiled, status = show(copy, ROSAFE_KERNELS="off")
     assert compiled

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness import PYTHON, ROOT
+from tests.harness import PYTHON, ROOT, proc
 
 TOOLS = Path("/usr/local/lib/rosafe/tools")  # folder of packages that scripts/install installs from PyPI
 
@@ -50,6 +50,7 @@ def test_mypy() -> None:
     """With mypy from PyPI: Debian's version takes five times as long."""
     if not (TOOLS / "mypy").is_dir():
         pytest.skip("mypy is not installed; run scripts/install --tests")
+    proc("stat")  # mypy imports psutil, which reads it
     check("env", f"PYTHONPATH={TOOLS}", PYTHON, "-m", "mypy")
 
 
