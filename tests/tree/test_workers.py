@@ -370,7 +370,9 @@ def test_the_estimated_duration_contains_no_waiting(
     waited = 0.2  # s
 
     class Waiting(Plain):
-        work = staticmethod(lambda block: threading.Event().wait(waited))
+        @staticmethod
+        def work(block: np.ndarray) -> None:
+            threading.Event().wait(waited)
 
     use_plain_stages(monkeypatch, preProc=Waiting)
     tree.add_input("input", feed, 1, 1.0, 1.0)
