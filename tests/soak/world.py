@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,7 +17,7 @@ import numpy as np
 import rospy
 import soundfile
 
-from rosafe.component import serialization
+from rosafe.component import serialization, state_publisher
 from rosafe.interface import BASS, CORE_REPRESENTATIONS, ROSAFE
 from rosafe.interface.arguments import check_parameters
 from rosafe.offline.chain import Chain
@@ -35,6 +35,7 @@ DRIFT = 0.15  # s, maximum deviation of bass' frames from the clock: one chunk, 
 SLOWER = 3.0  # an answer may take this many times the first one's time, if the machine is busy
 PEAK_MEMORY = 160 * 2**20  # bytes, maximum temporary increase for announced messages
 MORE_MEMORY = 64 * 2**20  # bytes, maximum increase after an attack
+TRIM_SECONDS = 1.1 * state_publisher.TRIM_ROUNDS * state_publisher.DIAGNOSTICS_PERIOD
 MORE_THREADS, MORE_FILES = 8, 16  # likewise: clients that are disconnecting
 T = TypeVar("T")
 
@@ -212,6 +213,19 @@ class World:
         """Return the resources of the processes."""
         processes = {"rosAFE": self.afe.process, "bass": self.bass, "genomixd": self.genomixd}
         return {name: ResourceUse.of(process.pid) for name, process in processes.items()}
+
+    def lowest_use(self) -> dict[str, ResourceUse]:
+        """Return the resources of the processes now, with their smallest memory in a period of the allocator's trimming.
+
+        Between two times that freed memory returns to the system, the memory changes by more than 100 MiB.
+        """
+        end, now = time.monotonic() + TRIM_SECONDS, self.use()
+        memory = {name: use.memory for name, use in now.items()}
+        while time.monotonic() < end:
+            wait_out(0.1)
+            now = self.use()
+            memory = {name: min(memory[name], use.memory) for name, use in now.items()}
+        return {name: replace(use, memory=memory[name]) for name, use in now.items()}
 
     # --- attacks ---
 
