@@ -2,7 +2,8 @@
 
 ``/usr/bin/python3 benchmarks/blocks.py`` starts real nodes on a private master for each row. bass plays the device
 ``scene:`` at 44.1 kHz in chunks of the length of a block, at most 2205 frames, with 20 chunks on its port. rosAFE
-computes the default tree of seven processors. The figures are averages over 12 s, which begin 2 s after the start.
+computes the default tree of seven processors. The figures are averages over 12 s, which begin 2 s after the start;
+each is the median of three such measurements, which alternate with those for one worker and with a subscriber.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import graph
+import numpy as np
 from report import Report, arguments
 
 BLOCKS = (12000, 2205, 882, 441, 220)
@@ -69,23 +71,27 @@ def main() -> int:
     parser = arguments("Processor time of the node for blocks of different lengths.")
     parser.add_argument("--seconds", type=float, default=12.0, help="duration of a measurement (default %(default)s)")
     parser.add_argument("--blocks", type=int, nargs="+", default=BLOCKS, help="frames per block (default %(default)s)")
+    parser.add_argument("--rounds", type=int, default=3, help="measurements of each figure (default %(default)s)")
     options = parser.parse_args()
-    if options.seconds <= 0 or min(options.blocks) < 1:
-        parser.error("--seconds: above 0; --blocks: at least 1")
+    if options.seconds <= 0 or min(*options.blocks, options.rounds) < 1:
+        parser.error("--seconds: above 0; --blocks, --rounds: at least 1")
     page = Report(options, "Blocks")
     found: list[list[str]] = []
     reference: list[float] = []
     for block in options.blocks:
-        default = graph.in_child(measure, block, None, options.seconds)
-        subscribed = graph.in_child(measure, block, None, options.seconds, [graph.topic("ild")])
-        single = graph.in_child(measure, block, 1, options.seconds)
+        cases = [(None, []), (None, [graph.topic("ild")]), (1, [])]  # workers, subscribed topics
+        measured = [
+            [graph.in_child(measure, block, workers, options.seconds, topics) for workers, topics in cases]
+            for _ in range(options.rounds)
+        ]
+        default, subscribed, single = np.median(measured, axis=0)
         reference = reference or [default[0], subscribed[0]]
         ratios = [default[0] / reference[0], subscribed[0] / reference[1]]
-        figures = [default[0], ratios[0], subscribed[0], ratios[1], single[0], default[1]]
-        found.append([str(block), *(f"{figure:.1f}" for figure in figures), f"{default[2]:.0f}"])
+        figures = [f"{x:.1f}" for x in (default[0], ratios[0], subscribed[0], ratios[1], single[0], default[1])]
+        found.append([str(block), *figures[:5], f"{default[0] / single[0]:.2f}", figures[5], f"{default[2]:.0f}"])
     base = f"over {options.blocks[0]}"
-    head = ["frames per block", "rosAFE, %", base, "ILD subscribed, %", base, "1 worker, %", "bass, %", "rosAFE, MB"]
-    page.table(head, found)
+    head = ["frames per block", "rosAFE, %", base, "ILD subscribed, %", base, "1 worker, %", "2 workers over 1"]
+    page.table([*head, "bass, %", "rosAFE, MB"], found)
     silent, connected = graph.in_child(idle, options.seconds)
     page.say()
     page.say(f"rosAFE without sound: {silent:.1f} % of a core; with sound, without processors: {connected:.1f} %.")

@@ -342,5 +342,6 @@ class AudioReader:
         return not self.ended and self._ring.waiting(self)
 
     def stop(self) -> None:
-        """Read no further block."""
+        """Read no further block, and forget the function of `open`, which refers to the caller."""
         self._ring.stop(self)
+        self.wake = lambda: None

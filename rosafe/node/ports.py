@@ -39,15 +39,27 @@ def signal_fields(kind: str, views: Sequence[WindowView], next_index: int, rate:
     return fields
 
 
+class _WindowMessage:
+    """Builds the message of a port. It refers to the history alone, so that removed processors are freed at once."""
+
+    def __init__(self, processor: Processor) -> None:
+        self._kind = processor.kind
+        self._history = processor.history
+        self._message = serialization.message_class("rosAFE", LAYOUTS[processor.kind].idl)
+
+    def build(self) -> Any:
+        """Return a message that refers to released blocks, which never change. They are serialized without a copy."""
+        views, next_index, signal = self._history.port_window()
+        return self._message(**signal_fields(self._kind, views, next_index, signal.rate))
+
+
 class OutputPort:
     """The topic of one processor."""
 
     def __init__(self, processor: Processor, publisher: Publisher, close: Callable[[], None]) -> None:
-        self.processor = processor
         self.close = close  # closes the topic
         self._publisher = publisher
-        self._message = serialization.message_class("rosAFE", LAYOUTS[processor.kind].idl)
-        self._newest = NewestMessage(self._build)
+        self._newest = NewestMessage(_WindowMessage(processor).build)
 
     @property
     def has_subscribers(self) -> bool:
@@ -57,11 +69,6 @@ class OutputPort:
     def publish(self) -> None:
         """Publish the window of the processor's history; without subscribers, it is built for the first one."""
         self._publisher.publish_newest(self._newest)
-
-    def _build(self) -> Any:
-        # The message refers to released blocks, which never change. They are serialized without a copy.
-        views, next_index, signal = self.processor.history.port_window()
-        return self._message(**signal_fields(self.processor.kind, views, next_index, signal.rate))
 
 
 def element(kind: str, name: str) -> str:

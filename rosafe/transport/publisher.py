@@ -96,6 +96,11 @@ class _Topic(topics._PublisherImpl):
     def set_queue_size(self, queue_size: int) -> None:
         """Do not create rospy's queue and its thread: each sender has its own."""
 
+    def close(self) -> None:
+        """Close the topic and free its latched message: the closed topic is part of a reference cycle in rospy."""
+        super().close()
+        self.latch = None
+
     def add_connection(self, connection: Any) -> bool:
         """Add a subscriber and send it the latched message."""
         # Complete messages are written at once, so delaying the last bytes (Nagle's algorithm) has no advantage.

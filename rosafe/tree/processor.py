@@ -161,8 +161,9 @@ class Processor(StateMachine):
 
     def check_source(self) -> None:
         """Read if its source has a block for which it did not call."""
-        if self._source_reader is not None:
-            self._source_reader.check()
+        reader = self._source_reader
+        if reader is not None:
+            reader.check()
 
     def end(self) -> None:
         """Remove the processor immediately. The result of a computation still in progress is discarded."""
@@ -172,8 +173,9 @@ class Processor(StateMachine):
             if self._started:
                 workers.remove_client(self)
             workers.wake()
-        if self._source_reader is not None:
-            self._source_reader.stop()
+        reader, self._source_reader = self._source_reader, None  # which refers to this processor
+        if reader is not None:
+            reader.stop()
         with self._publish_lock:
             self._context.listener.on_removed(self)
 
@@ -205,8 +207,9 @@ class Processor(StateMachine):
             if self.unpublished_block is not None:
                 self._publish(self.unpublished_block, monotonic())
                 return
-            if self._source_reader is not None:
-                self._source_reader.read()
+            reader = self._source_reader
+            if reader is not None:
+                reader.read()
             if self.current_block is not None:
                 self._compute(self.current_block)
         except BaseException as problem:  # any failure must reach the tree, and no other processor may keep waiting

@@ -87,7 +87,7 @@ class Soak:
         while self._round == 0 or time.monotonic() - self._begin < self._seconds:
             self._round += 1
             self._run_round()
-            self._uses.append(self._world.lowest_use() if self._seconds else self._world.use())
+            self._uses.append(self._world.use_without_tree() if self._seconds else self._world.use())
             self._say(", ".join(f"{name}: {use}" for name, use in self._uses[-1].items()))
         self._check_growth()
 

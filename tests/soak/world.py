@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -214,18 +214,15 @@ class World:
         processes = {"rosAFE": self.afe.process, "bass": self.bass, "genomixd": self.genomixd}
         return {name: ResourceUse.of(process.pid) for name, process in processes.items()}
 
-    def lowest_use(self) -> dict[str, ResourceUse]:
-        """Return the resources of the processes now, with their smallest memory in a period of the allocator's trimming.
+    def use_without_tree(self) -> dict[str, ResourceUse]:
+        """Remove all processors, and return the resources of the processes after unused memory was returned.
 
-        Between two times that freed memory returns to the system, the memory changes by more than 100 MiB.
+        The memory of a tree in use varies by more than 200 MiB, with the messages that wait for subscribers.
         """
-        end, now = time.monotonic() + TRIM_SECONDS, self.use()
-        memory = {name: use.memory for name, use in now.items()}
-        while time.monotonic() < end:
-            wait_out(0.1)
-            now = self.use()
-            memory = {name: min(memory[name], use.memory) for name, use in now.items()}
-        return {name: replace(use, memory=memory[name]) for name, use in now.items()}
+        assert self.graph.call("/bass/Stop").genom_success
+        self.afe.ok("Stop")
+        wait_out(TRIM_SECONDS)
+        return self.use()
 
     # --- attacks ---
 

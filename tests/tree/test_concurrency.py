@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import random
 import sys
 import threading
@@ -16,7 +17,7 @@ from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from tests.harness import PATIENCE, wait_for
 
-from .support import RATE, Feed, Plain, Recorder, use_plain_stages
+from .support import RATE, Feed, Plain, Recorder, end, use_plain_stages
 
 
 @pytest.fixture
@@ -136,6 +137,27 @@ def test_a_block_without_consumers_is_freed_when_the_children_are_finished(
     np.testing.assert_array_equal(last, [[3.0], [3.0]])
     latest = tree.add("gammatone", "latest", "parent")
     listener.wait_blocks(latest, 1)
+
+
+def test_removed_processors_are_freed_without_garbage_collection(feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each may have tens of MB, and Python looks for reference cycles only after very many allocations."""
+    use_plain_stages(monkeypatch)
+    listener = Recorder()
+    tree = Tree(listener, 1)
+    tree.add_input("input", feed, 1, 1.0, 1.0)
+    for name, kind, parent in (("pre", "preProc", "input"), ("bank", "gammatone", "pre"), ("cells", "ihc", "bank")):
+        tree.add(kind, name, parent)
+    feed.put(count=3)
+    listener.wait_blocks(tree.find("cells"), 3)
+    objects = [weakref.ref(one) for p in listener.processors for one in (p, p.history)]
+    gc.disable()
+    try:
+        end(tree, listener)
+        listener.forget()
+        feed.open(lambda: None)
+        assert [one() for one in objects if one() is not None] == []
+    finally:
+        gc.enable()
 
 
 def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
