@@ -693,7 +693,21 @@ MUTATIONS = (
         "                self._selector.register",
         "tests/ros/test_handshake_server.py",
     ),
+    _transport(
+        "closed-topic-keeps-message",
+        "publisher.py",
+        "        super().close()\n        self.latch = None\n",
+        "        super().close()\n",
+        "tests/ros/test_memory.py",
+    ),
     # --- tree
+    _tree(
+        "removed-input-in-a-cycle",
+        "processor.py",
+        "reader, self._source_reader = self._source_reader, None",
+        "reader = self._source_reader",
+        "tests/tree/test_concurrency.py -k freed",
+    ),
     _tree(
         "estimate-contains-waiting",
         "processor.py",
