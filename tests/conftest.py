@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import re
+import signal
 import subprocess
 from collections import Counter
 from collections.abc import Iterator
@@ -77,18 +78,19 @@ NO_KERNELS = (  # tests of stages that have no kernel: the same code runs with k
 )
 EACH_VARIANT = 4  # of the cases of a test, each fourth is repeated with numpy, or with kernels of an older processor
 EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal suite; all with scripts/test --long
+    "cli/test_corpus.py::test_names_that_are_not_utf8": 2,
     "cli/test_writers.py::test_many_concurrent_writers": 2,
-    "dsp/test_kernels.py::test_autocorrelation": 2,
+    "dsp/test_accuracy.py::test_errors_are_within_their_limits": 3,
+    "dsp/test_kernels.py::test_autocorrelation": 4,
     "dsp/test_processors.py::test_every_kernel": 3,
     "genomix/test_guide.py::test_usage_patterns_of_published_scripts": 2,
     "genomix/test_trouble.py::test_known_components_continue_without_a_master": 2,
     "localizer_node/test_attacks.py::test_frames_with_strange_values_and_indices": 2,
     "localizer_node/test_ear_check.py::test_the_command": 2,
     "localizer_node/test_node.py::test_offline_and_live_agree": 2,
-    "matlab/test_original_folder.py::test_a_client_script_in_the_original_folder": 2,
     "offline/test_examples.py::test_an_example": 2,
+    "offline/test_process.py::test_results_are_freed_with_their_last_reference": 3,
     "packaging/test_catkin.py::test_executables": 2,
-    "packaging/test_catkin.py::test_messages_equal_those_of_our_generator": 2,
     "plugins/test_documents.py::test_examples": 2,
     "plugins/test_versions.py::test_a_client_with_another_plugin": 2,
     "setups/test_parsing_time.py::test_time_is_bounded": 4,
@@ -108,9 +110,16 @@ def _default_signals() -> None:
 
 
 @pytest.fixture(autouse=True)
-def _import_variables() -> Iterator[None]:
-    """Restore the variables that decide whether a program can be a fork; commands in this process change them."""
+def _restored_process() -> Iterator[None]:
+    """Restore what commands in this process change: signal handlers, and the variables that decide about forks.
+
+    With the handler of a command, a process of `multiprocessing` that is forked later would not end at SIGTERM.
+    """
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     yield
+    for number, handler in handlers.items():
+        if signal.getsignal(number) is not handler:
+            signal.signal(number, handler)
     fork_server.restore_environment()
 
 

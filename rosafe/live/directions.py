@@ -20,6 +20,7 @@ MAX_DIRECTIONS = 3600  # of a posterior
 MAX_HOLD = 5  # columns without a message that are filled with the following one
 TRUTH_SECONDS = 0.1  # largest difference of the time of a truth and of an estimate
 _TRUTHS = 100  # that are kept: 5 s
+_WAITING = 10  # stamps for which only one message has arrived: 1 s
 GRID = angles.grid()
 SIZE = len(GRID) + MAX_SOURCES * SOURCE_NUMBERS + MAX_SOURCES
 
@@ -54,8 +55,7 @@ class DirectionTopics:
         self._world_frame = str(rospy.get_param(f"/{bass}/world_frame", "world")).strip("/") or "world"
         self._lock = threading.Lock()
         self._next = 0  # number of the next column
-        self._sources: Any = None
-        self._posterior: Any = None
+        self._waiting: dict[int, dict[str, Any]] = {}  # by stamp, messages of one topic until that of the other arrives
         self._truths: deque[Any] = deque(maxlen=_TRUTHS)
         self._subscribers = [
             rospy.Subscriber(topic, message_class, callback, queue_size=10, tcp_nodelay=True)
@@ -78,19 +78,26 @@ class DirectionTopics:
             self._truths.append(message)
 
     def _receive_sources(self, message: Any) -> None:
-        with self._lock:
-            self._sources = message
-            self._combine()
+        self._receive("sources", message)
 
     def _receive_posterior(self, message: Any) -> None:
-        with self._lock:
-            self._posterior = message
-            self._combine()
+        self._receive("posterior", message)
 
-    def _combine(self) -> None:
-        """Append a column if the newest messages of both topics belong together."""
-        sources, posterior, audio = self._sources, self._posterior, self._audio()
-        if sources is None or posterior is None or sources.header.stamp != posterior.header.stamp or audio is None:
+    def _receive(self, topic: str, message: Any) -> None:
+        """Append a column if the message of the other topic with the same stamp has arrived."""
+        stamp = message.header.stamp.to_nsec()
+        with self._lock:
+            pair = self._waiting.setdefault(stamp, {})
+            pair[topic] = message
+            if len(pair) == 2:
+                del self._waiting[stamp]
+                self._append_column(**pair)
+            elif len(self._waiting) > _WAITING:
+                del self._waiting[next(iter(self._waiting))]
+
+    def _append_column(self, sources: Any, posterior: Any) -> None:
+        audio = self._audio()
+        if audio is None:
             return
         end = audio.time_at(sources.header.stamp.to_sec())
         if end is None or end < 0:

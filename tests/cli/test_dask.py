@@ -34,6 +34,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         yield cluster
 
 
+@pytest.mark.exploration
 def test_a_worker_is_killed_during_the_run(tmp_path: Path, cluster: Any) -> None:
     sounds = corpus(tmp_path / "corpus", 40)
     (tmp_path / "corpus" / "bad.wav").write_bytes(b"")

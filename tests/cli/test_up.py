@@ -160,6 +160,7 @@ def test_a_faulty_setup_starts_no_process(alone: Graph, tmp_path: Path) -> None:
     assert "start roscore on that machine" in far.stderr
 
 
+@pytest.mark.exploration
 def test_a_killed_process_is_reported(alone: Graph) -> None:
     """On a terminal, which shows one screen. The URL of the page is complete, although it is wider than the screen."""
     command = ["rosafe", "up", "--live", "--no-browser", "--port", str(free_port()), "--live-port", str(free_port())]

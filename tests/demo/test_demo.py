@@ -139,6 +139,7 @@ def test_wrong_command_lines(arguments: list[str], reason: str, capsys: pytest.C
     assert error.count("\n") == 1 and reason in error
 
 
+@pytest.mark.exploration
 def test_an_unknown_device_leaves_no_files(tmp_path: Path, learn: Learn) -> None:
     learn(SCENE_RATE)
     with demo("hw:77,7", "--out", tmp_path / "out") as running:

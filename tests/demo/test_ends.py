@@ -48,6 +48,7 @@ def test_signal(stage: str, number: signal.Signals, tmp_path: Path, sound: Path)
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.exploration
 def test_repeated_ctrl_c_does_not_interrupt_the_clean_up(tmp_path: Path, sound: Path) -> None:
     """A terminal sends it repeatedly to the whole process group."""
     with demo(sound, "--out", tmp_path / "out") as running:

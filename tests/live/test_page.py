@@ -398,6 +398,7 @@ def test_nothing_exceeds_the_width_of_the_window(shown: Browser, width: int) -> 
         assert shown.run(f"return Math.max(...{edges})") <= width
 
 
+@pytest.mark.exploration
 def test_bass_is_killed_and_started_again(world: World, shown: Browser) -> None:
     assert world.bass is not None
     world.bass.stop(signal.SIGKILL)

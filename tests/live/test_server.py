@@ -219,8 +219,7 @@ def test_posterior_sources_and_truth_share_a_column(world: World) -> None:
         assert stride == 1 and abs(first / view["rate"] - times[0]) < 0.11
         known = np.isfinite(values[104])
         errors.extend(np.abs(values[104] - scene.azimuth(times + 0.05))[known])
-    # a column lasts 0.1 s, in which the source moves by 3.6 degrees; on a busy machine, single ones are late
-    assert np.median(errors) < 2.7 and max(errors) < 9
+    assert max(errors) < 4.5, "a column lasts 0.1 s, in which the source moves by 3.6 degrees"
 
 
 def test_unsuitable_messages_of_a_localizer_are_ignored() -> None:
@@ -237,19 +236,52 @@ def test_unsuitable_messages_of_a_localizer_are_ignored() -> None:
     assert slots[:, 0].tolist() == list(range(99, 91, -1))
 
 
-def test_a_step_back_of_the_time_begins_another_series(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def columns(monkeypatch: pytest.MonkeyPatch) -> tuple[directions.DirectionTopics, list[tuple[int, int]]]:
+    """Return an object that gets messages from the test, and a list of its columns: number and how many."""
     monkeypatch.setattr(rospy, "Subscriber", lambda *_, **__: None)
     monkeypatch.setattr(rospy, "get_param", lambda _, default: default)
     audio = SimpleNamespace(time_at=lambda moment: moment, sample_rate=16000)
-    columns: list[tuple[int, int]] = []
-    topics = directions.DirectionTopics(
-        lambda: cast(Any, audio), lambda number, column, _: columns.append((number, column.shape[1])), "bass"
-    )
+    found: list[tuple[int, int]] = []
+    append = lambda number, column, _: found.append((number, column.shape[1]))  # noqa: E731
+    return directions.DirectionTopics(lambda: cast(Any, audio), append, "bass"), found
+
+
+def pair(moment: float) -> tuple[Any, Any]:
+    """Return messages of sources and posterior."""
+    header = SimpleNamespace(stamp=rospy.Time.from_sec(moment), frame_id="head")
+    posterior = SimpleNamespace(header=header, azimuths=[0.0, 1.0], probability=[0.5, 0.5])
+    return SimpleNamespace(header=header, sources=[]), posterior
+
+
+def test_a_step_back_of_the_time_begins_another_series(
+    columns: tuple[directions.DirectionTopics, list[tuple[int, int]]],
+) -> None:
+    topics, found = columns
     for moment in (10.05, 10.15, 10.35, 1.05, 1.15):
-        header = SimpleNamespace(stamp=rospy.Time.from_sec(moment), frame_id="head")
-        topics._receive_sources(SimpleNamespace(header=header, sources=[]))
-        topics._receive_posterior(SimpleNamespace(header=header, azimuths=[0.0, 1.0], probability=[0.5, 0.5]))
-    assert columns == [(100, 1), (101, 1), (102, 2), (10, 1), (11, 1)]
+        sources, posterior = pair(moment)
+        topics._receive_sources(sources)
+        topics._receive_posterior(posterior)
+    assert found == [(100, 1), (101, 1), (102, 2), (10, 1), (11, 1)]
+
+
+def test_messages_of_one_stamp_belong_together_in_any_order(
+    columns: tuple[directions.DirectionTopics, list[tuple[int, int]]],
+) -> None:
+    """On a busy machine, several messages of one topic arrive before those of the other one; some never arrive."""
+    topics, found = columns
+    pairs = [pair(0.05 + 0.1 * number) for number in range(33)]
+    for sources, _ in pairs[:3]:
+        topics._receive_sources(sources)
+    for _, posterior in pairs[:3]:
+        topics._receive_posterior(posterior)
+    assert found == [(0, 1), (1, 1), (2, 1)]
+    for _, posterior in pairs[3:32]:
+        topics._receive_posterior(posterior)
+    for message, receive in zip(pairs[32], (topics._receive_sources, topics._receive_posterior), strict=True):
+        receive(message)
+    assert found[3:] == [(32, 1)]
+    assert len(topics._waiting) <= 10
 
 
 def test_a_page_gets_at_most_25_messages_and_200_kilobytes_per_second(world: World) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import rosafe
 from rosafe.localization import angles
@@ -15,6 +16,7 @@ TALKER = 10.0
 DELAY = 0.05  # s
 
 
+@pytest.mark.exploration
 def test_latency_from_the_azimuths_of_a_turning_head(kemar_model: Path, kemar: rosafe.Head) -> None:
     points = [[TURN * number, SPEED * TURN * (number % 2) - 45.0] for number in range(7)]
     times = np.arange(round(points[-1][0] * RATE)) / RATE

@@ -226,6 +226,7 @@ sources:
 """
 
 
+@pytest.mark.exploration
 def test_two_talkers_and_a_turning_head(
     graph: Graph, afe: Process, kemar_model: Path, talker: Path, other_talker: Path, tmp_path: Path
 ) -> None:

@@ -293,6 +293,7 @@ def test_a_master_that_is_away(tmp_path: Path, device: str, sphere_model: Path) 
         assert "input_0" in left and not any(name in left for name in yaml.safe_load(stored)[1:])
 
 
+@pytest.mark.exploration
 def test_recorded_sound_in_a_loop(graph: Graph, bass: Process, device: str, sphere_model: Path, tmp_path: Path) -> None:
     """`rosbag play --clock` jumps back in time, with its sound."""
     acquire(graph, device)

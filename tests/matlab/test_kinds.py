@@ -79,6 +79,7 @@ CLASSES = {
 }
 
 
+@pytest.mark.exploration
 def test_all_representations_are_equal_to_their_ports(world: World, sound: Path) -> None:
     results = octave.run_and_parse(
         world,

@@ -75,6 +75,7 @@ def _lines(text: str) -> str:
     return "\n".join(line.strip() for line in text.strip().splitlines()) + "\n"
 
 
+@pytest.mark.exploration
 @pytest.mark.parametrize("front_end", [False, True], ids=["alone", "MATLAB front-end first"])
 def test_a_client_script_in_the_original_folder(world: World, tmp_path: Path, front_end: bool) -> None:
     for name, text in FUNCTIONS.items():

@@ -89,6 +89,7 @@ def printed(done: subprocess.CompletedProcess[str]) -> str:
     return done.stdout
 
 
+@pytest.mark.exploration
 @pytest.mark.parametrize("package", ["rosAFE", "bass"])
 def test_messages_equal_those_of_our_generator(workspace: Path, package: str) -> None:
     """Byte for byte, including the messages of actions."""

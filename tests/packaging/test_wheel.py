@@ -156,6 +156,7 @@ def test_results_of_the_wheel(venv: Venv) -> None:
     assert not numpy[1] and numpy[2:] == pytest.approx(expected[2:], rel=1e-9)
 
 
+@pytest.mark.exploration
 def test_command_reports_missing_packages(venv: Venv, tmp_path: Path) -> None:
     assert venv.run("rosafe", "--version").stdout == f"rosafe {VERSION}\n"
     sound = tmp_path / "x.wav"
@@ -183,6 +184,7 @@ def test_command_reports_missing_packages(venv: Venv, tmp_path: Path) -> None:
         assert message in done.stderr
 
 
+@pytest.mark.exploration
 def test_without_a_compiler(tmp_path: Path) -> None:
     """The wheel is built for any machine, and the status reports that numpy and scipy are used."""
     programs = tmp_path / "bin"

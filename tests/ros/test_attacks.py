@@ -397,13 +397,13 @@ def test_a_slightly_too_long_window_is_rejected_and_the_stream_continues(afe: tu
 
 
 LISTENING = """
-import sys, rospy
+import os, sys, rospy
 from rosafe.transport import registration
 from bass.msg import binaudio_portStruct
 from std_msgs.msg import String
 registration.init_node("plain_listener", ["plain_listener"])
-rospy.Subscriber(sys.argv[1], binaudio_portStruct, lambda m: print("audio", len(m.left), flush=True))
-rospy.Subscriber(sys.argv[2], String, lambda m: print("text", len(m.data), flush=True))
+rospy.Subscriber(sys.argv[1], binaudio_portStruct, lambda m: os.write(1, f"audio {len(m.left)}\\n".encode()))
+rospy.Subscriber(sys.argv[2], String, lambda m: os.write(1, f"text {len(m.data)}\\n".encode()))
 rospy.spin()
 """
 
