@@ -694,6 +694,20 @@ MUTATIONS = (
         "tests/ros/test_handshake_server.py",
     ),
     _transport(
+        "late-request-ends-the-owner",
+        "succession.py",
+        "replaced or owner == address or (owner is None and not self.up)",
+        "replaced or (not self.up and owner in (address, None))",
+        "tests/startup/test_succession.py -k ignored",
+    ),
+    _transport(
+        "registers-after-the-name-was-lost",
+        "succession.py",
+        "            if self.succession.over:\n",
+        "            if False:\n",
+        "tests/startup/test_succession.py -k registers_nothing",
+    ),
+    _transport(
         "closed-topic-keeps-message",
         "publisher.py",
         "        super().close()\n        self.latch = None\n",

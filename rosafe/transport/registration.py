@@ -32,7 +32,7 @@ from rospy.impl.registration import (
 
 from rosafe.transport import master, paths, server_limits
 from rosafe.transport.connector import Connector
-from rosafe.transport.succession import NodeApiHandler, Succession
+from rosafe.transport.succession import MasterProxy, NodeApiHandler, Succession
 
 CHECK_SECONDS = 1.0  # between two checks of the registration at the master, and between two attempts to reach it
 SETTLE_SECONDS = 1.0  # maximum time that a request waits until its changes are registered
@@ -268,10 +268,16 @@ def init_node(name: str, argv: list[str], anonymous: bool = False, unless_taken:
     """
     global _registrar
     server_limits.install()
-    rospy.impl.init.ROSHandler = NodeApiHandler
     uri = master.uri()
-    # rospy's own calls of the master, such as for parameters, use this proxy.
-    rospy.core._xmlrpc_cache[uri] = rospy.core._LockedServerProxy(uri, transport=master.Transport())
+    # rospy's own calls of the master, such as for parameters and during its `init_node`, use this proxy.
+    proxy = rospy.core._xmlrpc_cache[uri] = MasterProxy(uri, transport=master.Transport())
+
+    def handler(name: str, master_uri: str) -> NodeApiHandler:
+        created = NodeApiHandler(name, master_uri)
+        proxy.succession = created.succession
+        return created
+
+    rospy.impl.init.ROSHandler = handler
     try:
         _read_log_parameter()
         with _user_lock() if unless_taken else contextlib.nullcontext():

@@ -3,7 +3,7 @@
 The master stores one address per name. The node that registers last under a name owns it, and the master asks the
 previous one to shut down. However, any registration counts: a late registration of an ending node takes the name back,
 and the master then asks the new node to shut down. Therefore a node that was asked to shut down registers nothing more,
-and a starting node ignores a request that the node it replaces has caused.
+and a node ignores a request that the node it replaces has caused, or that is out of date: it owns the name again.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+import rospy.core
 from rospy.impl.masterslave import ROSHandler
 
 from rosafe.transport import master
@@ -58,15 +59,15 @@ class Succession:
     def ignores(self, address: str) -> bool:
         """Return whether the node at `address` ignores a request to shut down in favour of a newer one.
 
-        It does if it is already ending, or if it continues. If two nodes start at the same time, the one that registers
-        last continues: each of them checks the owner only after its own last registration.
+        It does if it is already ending, or if it continues. If nodes start at the same time, the one that registers
+        last continues: each checks the owner only after its own last registration. A request may arrive after that.
         """
         with self.registration_lock:
             if self.over:
                 return True
             owner = self._owner()
             replaced = owner is not None and owner == self._predecessor
-            self.over = not (replaced or (not self.up and owner in (address, None)))
+            self.over = not (replaced or owner == address or (owner is None and not self.up))
         if not self.over:
             self.on_contest()
         return not self.over
@@ -74,6 +75,26 @@ class Succession:
     def is_lost(self, owner: str, address: str) -> bool:
         """Return whether `owner`, and not this node at `address`, keeps the name according to the master."""
         return owner not in (address, self._predecessor) and not self.ignores(address)
+
+
+class MasterProxy(rospy.core._LockedServerProxy):
+    """rospy's proxy of the master, for rospy's own registrations: none is sent once another node has the name.
+
+    Attributes
+    ----------
+    succession : Succession or None
+        None until the node has an address.
+    """
+
+    succession: Succession | None = None
+
+    def _ServerProxy__request(self, method: str, arguments: tuple[Any, ...]) -> Any:  # the name in xmlrpc.client
+        if self.succession is None or not method.startswith("register"):
+            return super()._ServerProxy__request(method, arguments)
+        with self.succession.registration_lock:
+            if self.succession.over:
+                return 1, "not sent: the node ends", []
+            return super()._ServerProxy__request(method, arguments)
 
 
 class NodeApiHandler(ROSHandler):

@@ -15,7 +15,7 @@ import rosmaster.master_api
 import rosservice
 
 from rosafe import interface
-from rosafe.transport.succession import REASON, Succession
+from rosafe.transport.succession import REASON, MasterProxy, Succession
 from tests.harness import SCRIPTS, Graph, Process, free_port, wait_for
 
 pytestmark = pytest.mark.forks  # the start of the processes does not matter
@@ -202,7 +202,7 @@ def registered(graph: Graph, address: str) -> Iterator[None]:
         (OLD, False, True),  # the last registration of the old node was late
         (OLD, True, True),
         (OWN, False, True),  # two nodes start, and this one was registered last
-        (OWN, True, False),  # the new node has not registered yet
+        (OWN, True, True),  # it has registered after the one that caused the request, and the request arrives late
         (NEW, False, False),
         (NEW, True, False),
     ],
@@ -216,6 +216,19 @@ def test_a_request_to_end_that_is_ignored(graph: Graph, address: str, up: bool, 
     with registered(graph, address):
         assert succession.ignores(OWN) == ignores
         assert (succession.over, bool(contests)) == (not ignores, ignores)
+
+
+def test_rospy_registers_nothing_after_the_name_was_lost(graph: Graph) -> None:
+    """rospy registers its own topics and services while the node starts."""
+    proxy = MasterProxy(graph.uri)
+    proxy.succession = Succession("/contested", graph.uri)
+    topic = ("/contested", "/contested/topic", "std_msgs/String", OWN)
+    assert proxy.registerPublisher(*topic)[0] == 1
+    assert proxy.lookupNode("/contested", "/contested") == [1, "node api", OWN]
+    assert proxy.unregisterPublisher("/contested", topic[1], OWN)[0] == 1
+    proxy.succession.over = True
+    assert proxy.registerPublisher(*topic)[0] == 1
+    assert proxy.lookupNode("/contested", "/contested")[0] == -1
 
 
 def test_the_log_registers_nothing(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
