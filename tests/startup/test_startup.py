@@ -272,7 +272,8 @@ def test_nohup_is_respected(graph: Graph) -> None:
         wait_for(lambda: "/lasting/kill" in graph.services(), what=lambda: str(node))
         wait_for(lambda: ("/lasting/Acquire/cancel", "/lasting") in graph.readers())
         os.kill(node.pid, signal.SIGHUP)
-        assert graph.call("/lasting/Stop").genom_success
+        assert graph.call("/lasting/Acquire", device="scene:", sampleRate=20000).genom_success
+        graph.message("/lasting/Audio", accept=lambda message: message.lastFrameIndex > 30000)  # it would have ended
         assert node.alive
         assert node.stop(signal.SIGTERM) == 0
 
