@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 from rosafe.component import generate
@@ -100,6 +101,8 @@ EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal s
 }
 ELSEWHERE = ("aarch64", "nehalem", "clang")  # kernels under qemu, or built by another compiler
 
+hypothesis.settings.register_profile("suite", deadline=None)  # a busy machine may take long for any example
+hypothesis.settings.load_profile("suite")
 generate.ensure_messages()  # test modules import rosAFE.msg and bass.msg at their top
 
 
