@@ -114,7 +114,7 @@ def _default_signals() -> None:
 
 @pytest.fixture(autouse=True)
 def _restored_process() -> Iterator[None]:
-    """Restore what commands in this process change: signal handlers, and the variables that decide about forks.
+    """Restore the signal handlers and the variables that decide about forks; commands in this process change them.
 
     With the handler of a command, a process of `multiprocessing` that is forked later would not end at SIGTERM.
     """

@@ -96,6 +96,7 @@ class DirectionTopics:
                 del self._waiting[next(iter(self._waiting))]
 
     def _append_column(self, sources: Any, posterior: Any) -> None:
+        """Append a column at the time of two messages with one stamp, unless this time of the audio is unknown."""
         audio = self._audio()
         if audio is None:
             return
