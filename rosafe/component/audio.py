@@ -109,7 +109,7 @@ class AudioRing:
                 self._record_gap(self._frames.newest + 1, lost)
                 self._frames.append(np.zeros((2, lost), np.int32))
             self._frames.append(rows_of(message, window - fresh, window))
-            stamp = message.stamp.sec + 1e-9 * message.stamp.nsec  # s since 1970; 0 if it is not given
+            stamp = message.stamp["sec"] + 1e-9 * message.stamp["nsec"]  # s since 1970; 0 if it is not given
             if fresh or lost:
                 self._times.add(newest, stamp or time.time())
             chunk_seconds = message.nFramesPerChunk / message.sampleRate
@@ -247,10 +247,11 @@ class AudioRing:
             if reader.position < frames.oldest:
                 self._record_gap(reader.position, frames.oldest - reader.position)
                 reader.position = frames.oldest
-            blocks = min((frames.newest + 1 - reader.position) // count, reader.combined_blocks())
+            blocks = min((frames.newest + 1 - reader.position) // count, reader.planned or reader.combined_blocks())
             if blocks < 1:
                 return None
             first, reader.position = reader.position, reader.position + blocks * count
+            reader.planned = 0
             reader.lag.blocks_read(blocks)
             reader.lag.update(self._unread(reader), time.monotonic())
             return frames.copy(first, blocks * count), reader.position
@@ -258,8 +259,11 @@ class AudioRing:
     def _is_complete(self, reader: AudioReader, now: float) -> bool:
         """Return whether there are as many unread blocks as `reader` reads at once."""
         unread = self._unread(reader) // reader.frames_per_block
-        if unread < 1 or unread >= reader.combined_blocks():
-            return unread >= 1
+        if unread < 1:
+            return False
+        reader.planned = reader.combined_blocks()
+        if unread >= reader.planned:
+            return True
         return reader.position <= reader.awaited or now - self._arrived_at > PAUSE_SECONDS
 
     def waiting(self, reader: AudioReader) -> bool:
@@ -317,15 +321,17 @@ class AudioReader:
         self.position = position  # number of the next frame to read; set by the ring
         self.lag = lag
         self.awaited = 0  # number of the last frame that a request waits for
+        self.planned = 0  # blocks to read at once; 0 if this was not computed since the last `read`
         self.ended = False
-        self.next_output: Callable[[], float] = lambda: 0  # blocks that end before this frame are not needed yet
+        # Called with the length of a block. Blocks that end before the returned frame are not needed yet.
+        self.next_output: Callable[[int], float] = lambda _: 0
         self.wake: Callable[[], None] = lambda: None
         self._ring = ring
 
     def combined_blocks(self) -> int:
         """Return the number of blocks to read at once."""
         most = int(COMBINED_SECONDS * self.sample_rate / self.frames_per_block)
-        needed = (self.next_output() - self.position) / self.frames_per_block
+        needed = (self.next_output(self.frames_per_block) - self.position) / self.frames_per_block
         return max(1, most if needed > most else math.ceil(needed))
 
     def open(self, wake: Callable[[], None]) -> None:

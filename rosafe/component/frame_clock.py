@@ -8,6 +8,7 @@ the stamps' lower convex hull that spans their mean.
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from typing import NamedTuple
 
@@ -54,15 +55,19 @@ class FrameTime:
             return
         if self._points:
             same_bin = self._bin(frame) == self._bin(self._points[-1][0])
-            if same_bin and self._residual(frame, time) > self._residual(*self._points[-1]):
+            if same_bin and self._residual(frame, time) >= self._residual(*self._points[-1]):
                 return  # most stamps of short chunks
-            if self._was_set(frame, time):
+            line = self._fit()
+            if self._was_set(line, frame, time):
                 self.begin(self._nominal)
-        self._fitted = None
+            elif same_bin:
+                self._points.pop()
+                if time >= line.at(frame):  # the line is still below all points: it is fitted once per bin
+                    self._points.append((frame, time))
+                    return
         if not self._points:
             self._first = frame
-        elif self._bin(frame) == self._bin(self._points[-1][0]):
-            self._points.pop()
+        self._fitted = None
         self._points.append((frame, time))
         while frame - self._points[0][0] > WINDOW_SECONDS * self._nominal:
             self._points.popleft()
@@ -74,15 +79,14 @@ class FrameTime:
         """Return the delay of a stamp, up to a constant."""
         return time - (frame - self._first) / self._nominal
 
-    def _was_set(self, frame: int, time: float) -> bool:
+    def _was_set(self, line: LinearClock, frame: int, time: float) -> bool:
         """Return whether the system clock has been set, back or forth."""
         if len(self._points) < 2:
             return False
-        line = self._fit()
-        late = list(self._points)[-LATE_BINS:]
         if time < line.at(frame) - SET_SECONDS:
             return True
-        return len(self._points) > LATE_BINS and all(stamp > line.at(n) + SET_SECONDS for n, stamp in late)
+        newest = itertools.islice(reversed(self._points), LATE_BINS)
+        return len(self._points) > LATE_BINS and all(stamp > line.at(n) + SET_SECONDS for n, stamp in newest)
 
     def line(self, frame: int) -> LinearClock | None:
         """Return the clock at `frame`, or None without stamps.

@@ -16,7 +16,8 @@ import importlib
 import itertools
 import struct
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from operator import attrgetter
+from typing import Any, NamedTuple, Protocol
 
 import genpy
 import numpy as np
@@ -58,15 +59,32 @@ def nested_dtype(shape: tuple[int, ...]) -> np.dtype:
     return layout
 
 
-def _pack_nested(view: WindowView) -> memoryview:
-    """Return the bytes of a signal of shape (..., frames), each level preceded by its count."""
-    record = np.empty((), nested_dtype(view.shape))
+class _Template(NamedTuple):
+    """The bytes of a signal of one shape, with its counts and without its samples, and the layout of the samples."""
+
+    record: np.ndarray  # uint8
+    offset: int  # bytes
+    strides: tuple[int, ...]  # bytes
+
+
+@functools.lru_cache(maxsize=256)
+def _template(shape: tuple[int, ...]) -> _Template:
+    record = np.zeros((), nested_dtype(shape))
     level = record
-    for length in view.shape:
+    for length in shape:
         level["n"] = length
         level = level["d"]
-    view.copy_to(level)
-    return record.reshape(1).view(np.uint8).data
+    offset = level.__array_interface__["data"][0] - record.__array_interface__["data"][0]
+    return _Template(record.reshape(1).view(np.uint8), offset, level.strides)
+
+
+def _pack_nested(view: WindowView) -> memoryview:
+    """Return the bytes of a signal of shape (..., frames), each level preceded by its count."""
+    shape = view.shape
+    template = _template(shape)
+    record = template.record.copy()
+    view.copy_to(np.ndarray(shape, _SAMPLES["double"], record.data, template.offset, template.strides))
+    return record.data
 
 
 def _write_rows(out: ByteSink, pieces: Sequence[np.ndarray], frames: int) -> None:
@@ -273,15 +291,40 @@ def _members_decoder(component: interface.ComponentSpec, members: Members) -> Ca
 # --- message classes --------------------------------------------------------------------------------------------
 
 
+def _message_encoders(component: interface.ComponentSpec, members: Members) -> list[tuple[str, Any, Encoder]]:
+    """Return name, getter and encoder of each member of a message. Successive scalars are written together."""
+    steps: list[tuple[str, Any, Encoder]] = []
+    for scalar, some in itertools.groupby(members, lambda member: member[1] in _SCALARS):
+        run = list(some)
+        if scalar and len(run) > 1:
+            names, kinds = zip(*run, strict=True)
+            form = struct.Struct("<" + "".join(_SCALARS[kind] for kind in kinds))
+            steps.append((", ".join(names), attrgetter(*names), functools.partial(_write_scalars, form)))
+        else:
+            steps += [(name, attrgetter(name), _encoder(component, kind)) for name, kind in run]
+    return steps
+
+
+def _write_scalars(form: struct.Struct, out: ByteSink, values: tuple[Any, ...]) -> None:
+    out.write(form.pack(*values))
+
+
 def _with_arrays(component: interface.ComponentSpec, generated: type[Any], members: Members) -> type[Any]:
     """Return a subclass of a generated class that serializes arrays."""
-    encoders = [(name, _encoder(component, kind)) for name, kind in members]
+    encoders = _message_encoders(component, members)
     decode = _members_decoder(component, members)
+
+    def create(self: Any, *values: Any, **fields: Any) -> None:
+        if len(fields) != len(members):
+            generated.__init__(self, *values, **fields)
+            return
+        for name, value in fields.items():  # without defaults, whose creation takes longer
+            setattr(self, name, value)
 
     def serialize(self: Any, out: ByteSink) -> None:
         try:
-            for name, encode in encoders:
-                encode(out, getattr(self, name))
+            for name, get, encode in encoders:
+                encode(out, get(self))
         except (struct.error, TypeError, ValueError, LookupError, AttributeError) as problem:
             raise genpy.SerializationError(f"{self._type}: {name}: {problem}") from problem
 
@@ -290,8 +333,8 @@ def _with_arrays(component: interface.ComponentSpec, generated: type[Any], membe
             setattr(self, name, value)
         return self
 
-    members_of_class = {"serialize": serialize, "deserialize": deserialize, "accepts_buffers": True}
-    return type(generated.__name__, (generated,), members_of_class)
+    methods = {"__init__": create, "serialize": serialize, "deserialize": deserialize}
+    return type(generated.__name__, (generated,), {**methods, "accepts_buffers": True})
 
 
 def _generated(package: str, module: str, name: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -56,6 +57,8 @@ class PublishedTree:
         self._captured = captured
         self._catch_up = catch_up
         self._ports: dict[Processor, OutputPort] = {}
+        self._subscribed: tuple[Processor, ...] | None = None  # those with subscribers; None if this may have changed
+        self._subscribed_lock = threading.Lock()
         self._activities: dict[Processor, Activity] = {}
         self._input_port = self._advertise("input")
         self._time_class = serialization.message_class("rosAFE", "::rosAFE::frameTime")
@@ -83,19 +86,31 @@ class PublishedTree:
         if processor.error is not None:
             raise ComponentError("::genom::unkex", what=str(Failure.of(processor)))
 
-    def next_output(self) -> float:
-        """Return an index of audio: blocks that end before it are not needed yet.
+    def next_output(self, block_frames: int) -> float:
+        """Return an index of audio: blocks of `block_frames` that end before it are not needed yet.
 
         It is infinite if no port has subscribers, and 0 if each block is needed.
         """
-        needed = 0.0 if self._frame_time.has_subscribers else math.inf
-        subscribed = []
-        for processor, port in tuple(self._ports.items()):
-            if processor.observers:
-                return 0
-            if port.has_subscribers:
-                subscribed.append(processor)
-        return min((next_output(processor) for processor in subscribed), default=needed)
+        if self.tree.is_observed:
+            return 0
+        subscribed = self._subscribed
+        if subscribed is None:
+            with self._subscribed_lock:
+                ports = tuple(self._ports.items())
+                subscribed = self._subscribed = tuple(one for one, port in ports if port.has_subscribers)
+        if not subscribed:
+            return 0 if self._frame_time.has_subscribers else math.inf
+        if any(processor.signal.hop <= block_frames for processor in subscribed):
+            return 0
+        return min(map(next_output, subscribed))
+
+    def _forget_subscribed(self) -> None:
+        with self._subscribed_lock:
+            self._subscribed = None
+
+    def _on_subscribers_changed(self) -> None:
+        self._forget_subscribed()
+        self._catch_up()
 
     # --- events of the tree, on its threads ---
 
@@ -107,6 +122,7 @@ class PublishedTree:
             publisher = self._advertise(processor.kind, processor.name)
             port = OutputPort(processor, publisher, publisher.unregister)
         self._ports[processor] = port
+        self._forget_subscribed()
         self.health.added(processor, self._meters[processor.kind])
         port.publish()
 
@@ -135,6 +151,7 @@ class PublishedTree:
         """Close the port and end the activity."""
         self.health.ended(processor)
         port = self._ports.pop(processor, None)  # None if it could not be opened
+        self._forget_subscribed()
         if port is not None:
             port.close()
         activity = self._activities.get(processor)
@@ -144,5 +161,5 @@ class PublishedTree:
     def _advertise(self, kind: str, name: str = "") -> Publisher:
         message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
         publisher = self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
-        publisher.impl.on_connection = self._catch_up
+        publisher.impl.on_subscribers_changed = self._on_subscribers_changed
         return publisher

@@ -14,7 +14,7 @@ class BufferList:
 
     def write(self, data: Any, /) -> None:
         """Append the bytes of a contiguous buffer."""
-        size = data.nbytes if hasattr(data, "nbytes") else len(data)
+        size = len(data) if isinstance(data, bytes) else data.nbytes
         if size:
             self.pieces.append(data)
             self.size += size

@@ -48,6 +48,8 @@ class Processor(StateMachine):
 
     Attributes
     ----------
+    trusted : bool
+        Whether its stage is not a plugin, which may not return.
     error : BaseException or None
         The reason for its failure.
     blocks : int
@@ -73,6 +75,7 @@ class Processor(StateMachine):
         # At most 30 attributes, with those of `StateMachine`: with more, each access takes longer.
         self.observers = context.observers
         self.name = name
+        self.trusted = not isinstance(stage, CheckedStage)
         self.error: BaseException | None = None
         self.blocks = 0
         self.changes = ParameterUpdates(stage)
@@ -140,11 +143,6 @@ class Processor(StateMachine):
         """Return parameters, in the order of the parameter structure, and derived values of the same moment."""
         stage = self.stage
         return {**stage.parameters, **stage.derived}
-
-    @property
-    def trusted(self) -> bool:
-        """Whether its stage is not a plugin, which may not return."""
-        return not isinstance(self.changes.final_stage, CheckedStage)
 
     # --- life ---
 

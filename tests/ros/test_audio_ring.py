@@ -49,7 +49,7 @@ def message(rate: int, index: int, left: np.ndarray, right: np.ndarray | None = 
         "nChunksOnPort": 1,
         "nFramesPerChunk": len(left),
         "problem": "",
-        "stamp": SimpleNamespace(sec=0, nsec=0),
+        "stamp": {"sec": 0, "nsec": 0},
     }
     return SimpleNamespace(**{**fields, **other})
 
@@ -364,14 +364,14 @@ def test_the_first_message_of_a_new_acquisition_may_still_be_on_its_way() -> Non
         return False
 
     ended = Source(index=50).message()
-    ended.stamp = SimpleNamespace(sec=1_000_000_000, nsec=0)
+    ended.stamp = {"sec": 1_000_000_000, "nsec": 0}
     feed(ended)
     without = ring.open_reader(4, 60.0, lambda: False)
     assert without is not None and without.sample_rate == RATE, "no other message arrives"
     reader = ring.open_reader(4, 60.0, arrives)
     assert reader is not None and reader.sample_rate == 2 * RATE
     running = Source(rate=RATE, index=50).message()
-    running.stamp = SimpleNamespace(sec=int(time.time()) + 60, nsec=0)
+    running.stamp = {"sec": int(time.time()) + 60, "nsec": 0}
     feed(running)
     reader = ring.open_reader(4, 60.0, arrives)
     assert reader is not None and reader.sample_rate == RATE, "of a running acquisition: no wait"
@@ -487,7 +487,7 @@ def test_unobserved_blocks_are_read_together() -> None:
     feed(source.message())
     reader, woken, got = opened(ring, block), [], list[int]()
     observed = False
-    reader.next_output = lambda: 0 if observed else math.inf
+    reader.next_output = lambda _: 0 if observed else math.inf
     reader.open(lambda: woken.append(source.index))
 
     def play(frames: int) -> None:
@@ -529,7 +529,7 @@ def test_unobserved_blocks_are_read_when_the_sound_pauses(monkeypatch: pytest.Mo
     feed, source = ring.connect(), Source(rate=1000, window=16)
     feed(source.message())
     reader = opened(ring, 8)
-    reader.next_output = lambda: math.inf
+    reader.next_output = lambda _: math.inf
     source.index = 12
     feed(source.message())
     assert reader.waiting
