@@ -189,6 +189,20 @@ MUTATIONS = (
         "tests/ros/test_audio_ring.py -k unobserved",
     ),
     _component(
+        "early-stamp-ignored",
+        "frame_clock.py",
+        "if time >= line.at(frame):",
+        "if True:",
+        "tests/ros/test_frame_time.py",
+    ),
+    _node(
+        "new-subscriber-forgotten",
+        "published_tree.py",
+        "        self._forget_subscribed()\n        self._catch_up()",
+        "        self._catch_up()",
+        "tests/ros/test_ports.py -k short_blocks",
+    ),
+    _component(
         "clock-step-without-limit",
         "frame_clock.py",
         "step = min(STEP_SECONDS, SLEW * (frame - self._last_output.frame) / self._nominal)",
@@ -746,8 +760,8 @@ MUTATIONS = (
     _tree(
         "plugin-on-receiving-thread",
         "workers.py",
-        "task is None or not task.trusted or task",
-        "task is None or task",
+        "if not task.trusted or task",
+        "if task",
         "tests/tree/test_workers.py -k calling_thread",
     ),
     _tree(

@@ -251,7 +251,6 @@ class AudioRing:
             if blocks < 1:
                 return None
             first, reader.position = reader.position, reader.position + blocks * count
-            reader.planned = 0
             reader.lag.blocks_read(blocks)
             reader.lag.update(self._unread(reader), time.monotonic())
             return frames.copy(first, blocks * count), reader.position
@@ -321,7 +320,7 @@ class AudioReader:
         self.position = position  # number of the next frame to read; set by the ring
         self.lag = lag
         self.awaited = 0  # number of the last frame that a request waits for
-        self.planned = 0  # blocks to read at once; 0 if this was not computed since the last `read`
+        self.planned = 0  # blocks to read at once, from the last check whether there are enough; 0 before the first
         self.ended = False
         # Called with the length of a block. Blocks that end before the returned frame are not needed yet.
         self.next_output: Callable[[int], float] = lambda _: 0

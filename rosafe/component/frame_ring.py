@@ -54,9 +54,8 @@ class FrameRing:
         if at + count > self.capacity:
             return np.array_equal(self.copy(first, count), samples)
         # Bytes are compared many times faster than short arrays.
-        return all(
-            row[at : at + count].tobytes() == new.tobytes() for row, new in zip(self._samples, samples, strict=True)
-        )
+        first_ear, second_ear = self._samples[:, at : at + count]
+        return first_ear.tobytes() == samples[0].tobytes() and second_ear.tobytes() == samples[1].tobytes()
 
     def copy(self, first: int, count: int) -> np.ndarray:
         """Return `count` frames from number `first` on, (2, count). They must be in the ring."""

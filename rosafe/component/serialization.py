@@ -291,18 +291,26 @@ def _members_decoder(component: interface.ComponentSpec, members: Members) -> Ca
 # --- message classes --------------------------------------------------------------------------------------------
 
 
-def _message_encoders(component: interface.ComponentSpec, members: Members) -> list[tuple[str, Any, Encoder]]:
-    """Return name, getter and encoder of each member of a message. Successive scalars are written together."""
-    steps: list[tuple[str, Any, Encoder]] = []
+class _MessagePart(NamedTuple):
+    """A member of a message, or several successive ones."""
+
+    names: str
+    get: Callable[[Any], Any]  # returns its value, or a tuple of several
+    encode: Encoder
+
+
+def _parts_of_message(component: interface.ComponentSpec, members: Members) -> list[_MessagePart]:
+    """Return the members of a message. Successive scalars are written together."""
+    parts: list[_MessagePart] = []
     for scalar, some in itertools.groupby(members, lambda member: member[1] in _SCALARS):
         run = list(some)
         if scalar and len(run) > 1:
             names, kinds = zip(*run, strict=True)
             form = struct.Struct("<" + "".join(_SCALARS[kind] for kind in kinds))
-            steps.append((", ".join(names), attrgetter(*names), functools.partial(_write_scalars, form)))
+            parts.append(_MessagePart(", ".join(names), attrgetter(*names), functools.partial(_write_scalars, form)))
         else:
-            steps += [(name, attrgetter(name), _encoder(component, kind)) for name, kind in run]
-    return steps
+            parts += [_MessagePart(name, attrgetter(name), _encoder(component, kind)) for name, kind in run]
+    return parts
 
 
 def _write_scalars(form: struct.Struct, out: ByteSink, values: tuple[Any, ...]) -> None:
@@ -311,7 +319,7 @@ def _write_scalars(form: struct.Struct, out: ByteSink, values: tuple[Any, ...]) 
 
 def _with_arrays(component: interface.ComponentSpec, generated: type[Any], members: Members) -> type[Any]:
     """Return a subclass of a generated class that serializes arrays."""
-    encoders = _message_encoders(component, members)
+    parts = _parts_of_message(component, members)
     decode = _members_decoder(component, members)
 
     def create(self: Any, *values: Any, **fields: Any) -> None:
@@ -323,10 +331,10 @@ def _with_arrays(component: interface.ComponentSpec, generated: type[Any], membe
 
     def serialize(self: Any, out: ByteSink) -> None:
         try:
-            for name, get, encode in encoders:
-                encode(out, get(self))
+            for part in parts:
+                part.encode(out, part.get(self))
         except (struct.error, TypeError, ValueError, LookupError, AttributeError) as problem:
-            raise genpy.SerializationError(f"{self._type}: {name}: {problem}") from problem
+            raise genpy.SerializationError(f"{self._type}: {part.names}: {problem}") from problem
 
     def deserialize(self: Any, data: bytes) -> Any:
         for name, value in decode(_Reader(data)).items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from rosafe.transport.publisher import NewestMessage, Publisher
 from rosafe.tree.processor import Processor
 from rosafe.tree.sliding_window import WindowView
 
-_EMPTY = np.zeros(0)  # for fields that a kind does not use, such as ILD's `right`
+_EMPTY = WindowView([np.zeros(0)])  # for fields that a kind does not use, such as ILD's `right`
 
 
 def signal_fields(kind: str, views: Sequence[WindowView], next_index: int, rate: float) -> dict[str, Any]:
@@ -59,16 +60,13 @@ class OutputPort:
     def __init__(self, processor: Processor, publisher: Publisher, close: Callable[[], None]) -> None:
         self.close = close  # closes the topic
         self._publisher = publisher
-        self._newest = NewestMessage(_WindowMessage(processor).build)
+        # Publishes the window of the processor's history; without subscribers, it is built for the first one.
+        self.publish = functools.partial(publisher.publish_newest, NewestMessage(_WindowMessage(processor).build))
 
     @property
     def has_subscribers(self) -> bool:
         """Whether the topic has subscribers."""
         return self._publisher.has_subscribers
-
-    def publish(self) -> None:
-        """Publish the window of the processor's history; without subscribers, it is built for the first one."""
-        self._publisher.publish_newest(self._newest)
 
 
 def element(kind: str, name: str) -> str:

@@ -68,6 +68,7 @@ class PublishedTree:
         self._meters = {kind: node.meters[ROSAFE.service(r.request).task] for kind, r in KINDS.items()}
         self.tree = Tree(self, workers, real_time=True)
         self.health = ProcessorHealth(self.tree, choices)
+        self.on_executed = self.health.executed
 
     def run(self, activity: Activity, processor: Processor, save: Callable[[], None]) -> None:
         """Run the `activity` of a processor: both end together. `save` is called after each change of the tree."""
@@ -125,10 +126,6 @@ class PublishedTree:
         self._forget_subscribed()
         self.health.added(processor, self._meters[processor.kind])
         port.publish()
-
-    def on_executed(self, processor: Processor, seconds: float) -> None:
-        """Add the computing time to genom_state and /diagnostics."""
-        self.health.executed(processor, seconds)
 
     def on_released(self, processor: Processor, block: Block) -> None:
         """Publish the processor's window; for the input also the capture time of its newest frame."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
@@ -46,6 +47,10 @@ class Block(NamedTuple):
     def rate(self) -> float:
         """Frames per second."""
         return self.signal.rate
+
+
+# Creates a block from all its attributes, without Python's constructor of named tuples.
+new_block: Callable[[tuple[Any, ...]], Block] = functools.partial(tuple.__new__, Block)
 
 
 class Source(Protocol):

@@ -34,13 +34,20 @@ class ParameterUpdates:
     ----------
     final_stage : Stage
         The stage after all pending updates, its own and its parents'. For queries only: it is never run.
+    look_ahead : int
+        That of the active stage.
     """
 
     def __init__(self, stage: Stage) -> None:
         self.final_stage = stage
-        self._active = stage
+        self._activate(stage)
         self._queue: list[ParameterUpdate] = []
         self._lock = threading.Lock()  # guards _queue, and the replacement of _active
+
+    def _activate(self, stage: Stage) -> None:
+        self._active = stage
+        self._active_needs = stage.required_extra
+        self.look_ahead = stage.look_ahead
 
     def preview(self, name: str, value: Any) -> Stage:
         """Return the stage after one more update, without applying it. Raises ValueError if the stage rejects it."""
@@ -68,10 +75,10 @@ class ParameterUpdates:
     def needs(self, number: int) -> str:
         """Return the extra of the parent that block `number` should carry, or an empty string."""
         if not self._queue:
-            return self._active.required_extra
+            return self._active_needs
         with self._lock:
             due = self._due(number)
-            return due[-1].needs if due else self._active.required_extra
+            return due[-1].needs if due else self._active_needs
 
     def required_input(self, frames: int) -> int:
         """Return a lower limit of the number of input frames after which `frames` more can be output."""
@@ -82,14 +89,14 @@ class ParameterUpdates:
         """Return the stage for `block` after all due updates that fit it, or None if no stage can process it."""
         stage = self._active
         if not self._queue and block.signal is stage.input_format:
-            needs = stage.required_extra
+            needs = self._active_needs
             return stage if not needs or needs in block.extras else None
         with self._lock:
             due = self._due(block.number)
             for count in range(len(due), -1, -1):
                 changed = _changed(stage, block.signal, due[:count])
                 if changed is not None and (not changed.required_extra or changed.required_extra in block.extras):
-                    self._active = changed
+                    self._activate(changed)
                     del self._queue[:count]
                     return changed
         return None

@@ -13,7 +13,7 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.plugin_checks import CheckedStage, PluginError
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
-from rosafe.tree.block import Block, Source
+from rosafe.tree.block import Block, Source, new_block
 from rosafe.tree.context import TreeContext
 from rosafe.tree.history import History
 from rosafe.tree.parameter_updates import ParameterUpdates
@@ -243,16 +243,16 @@ class Processor(StateMachine):
         if stage.EXTRAS:
             stage.provide = _requested_extras(stage, self.children, block.number)
         data, extras = block.parts[0], block.extras
-        required = extras and stage.required_extra
+        required = stage.required_extra if extras else ""
         if self.output_buffer_for is not None:
             output = stage.process(data, extras[required] if required else None, self.output_buffer_for(block))
         else:
             output = stage.process(data, extras[required]) if required else stage.process(data)
         parts = output if isinstance(output, tuple) else (output,)
         next_index = block.next_index
-        if look_ahead := stage.look_ahead:
+        if look_ahead := self.changes.look_ahead:
             next_index = max(0, next_index - look_ahead * stage.input_format.hop)
-        return Block(block.number, parts, next_index, stage.output_format, stage.provided)
+        return new_block((block.number, parts, next_index, stage.output_format, stage.provided))
 
     def _publish(self, block: Block, begun: float) -> None:
         """Add the last released block to the history and notify the listener."""

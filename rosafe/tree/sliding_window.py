@@ -6,9 +6,8 @@ blocks arrive.
 
 from __future__ import annotations
 
-import functools
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -26,30 +25,29 @@ def frames_in(seconds: float, rate: float) -> int:
     return math.floor(seconds * rate + 1e-9)
 
 
-@dataclass(frozen=True)
 class WindowView:
     """The content of a window at one moment: pieces of equal leading shape, in order along the last axis.
 
-    The first `skip` frames of the first piece are not part of the window.
+    Attributes
+    ----------
+    pieces : sequence of ndarray
+        The first `skip` frames of the first one are not part of the window.
+    frames : int
+        The number of frames.
+    shape : tuple of int
+        (..., frames)
+    derived : dict
+        Results that were computed from the content, by name, so that they are computed once: see `select`.
     """
 
-    pieces: tuple[FloatArray, ...]
-    skip: int = 0
+    __slots__ = ("derived", "frames", "pieces", "shape", "skip")
 
-    @functools.cached_property
-    def frames(self) -> int:
-        """The number of frames."""
-        return sum(piece.shape[-1] for piece in self.pieces) - self.skip
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(..., frames)"""
-        return (*self.pieces[0].shape[:-1], self.frames)
-
-    @functools.cached_property
-    def derived(self) -> dict[int | str, Any]:
-        """Results that were computed from the content, by name, so that they are computed once: see `select`."""
-        return {}
+    def __init__(self, pieces: Sequence[FloatArray], skip: int = 0) -> None:
+        self.pieces = pieces
+        self.skip = skip
+        self.frames = sum([piece.shape[-1] for piece in pieces]) - skip
+        self.shape = (*pieces[0].shape[:-1], self.frames)
+        self.derived: dict[int | str, Any] = {}
 
     def select(self, row: int) -> WindowView:
         """Return the part at index `row` of the first axis, such as one ear."""
@@ -61,8 +59,10 @@ class WindowView:
         """Return the view with its first two axes exchanged, such as [channel][lag] to the port's [lag][channel]."""
         return WindowView(tuple(piece.swapaxes(0, 1) for piece in self.pieces), self.skip)
 
-    def trimmed(self) -> list[FloatArray]:
+    def trimmed(self) -> Sequence[FloatArray]:
         """Return the pieces without the skipped frames, oldest first."""
+        if not self.skip:
+            return self.pieces
         return [self.pieces[0][..., self.skip :], *self.pieces[1:]]
 
     def copy_to(self, target: FloatArray) -> None:

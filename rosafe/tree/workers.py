@@ -190,7 +190,11 @@ class Workers:
         if self.real_time and idle and not me.refusals:
             me.has_slot, self._free_slots = True, self._free_slots - 1
             end = time.monotonic() + SHORT_RUN_SECONDS
-            while me.has_slot and (task := self._pop_short_task()) is not None:
+            while me.has_slot and self._ready:
+                task = self._ready[0][2]
+                if not task.trusted or task.estimated_seconds > SHORT_TASK_SECONDS:
+                    break
+                heapq.heappop(self._ready)
                 if task.begin_work():
                     me.task = task
                     self._work(task)
@@ -208,14 +212,6 @@ class Workers:
             self.wake()
         elif computing is None and not self._woken:
             self.wake(1)
-
-    def _pop_short_task(self) -> Task | None:
-        """Return the deepest ready task if it is trusted and short."""
-        task = self._ready[0][2] if self._ready else None
-        if task is None or not task.trusted or task.estimated_seconds > SHORT_TASK_SECONDS:
-            return None
-        heapq.heappop(self._ready)
-        return task
 
     def _work(self, task: Task) -> None:
         """Run a task without the lock."""

@@ -70,6 +70,19 @@ def test_delays_of_stamps_do_not_affect_the_line(kind: str, skew: float, chunk: 
     assert abs(line.rate / rate - 1) < 5e-6
 
 
+@pytest.mark.parametrize("seconds", [2, 20])  # the rate is not fitted yet, and is fitted
+def test_the_line_is_never_later_than_a_stamp(seconds: int) -> None:
+    """An earlier stamp lowers it at once, also within the same bin."""
+    times = FrameTime()
+    times.begin(1000)
+    frames = range(100, seconds * 1000, 100)  # 2 or 3 in each bin
+    for frame in frames:
+        times.add(frame, BEGIN + frame / 1000 + 0.02)
+    for step in range(1, 6):
+        times.add(frames[-1] + step, BEGIN + (frames[-1] + step) / 1000 + 0.02 - 0.003 * step)
+        assert times._fit().at(frames[-1] + step) < BEGIN + (frames[-1] + step) / 1000 + 0.0201 - 0.003 * step
+
+
 def test_a_clock_that_is_set_and_a_restarted_stream() -> None:
     times = FrameTime()
     times.begin(1000)
