@@ -17,7 +17,7 @@ from rosafe.bass.sources import Chunk
 from rosafe.interface import ComponentError
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(1, 50), st.lists(st.tuples(st.integers(0, 120), st.integers(0, 80)), max_size=30))
 def test_window_contains_the_newest_frames_of_the_stream(frames: int, steps: list[tuple[int, int]]) -> None:
     window = AudioWindow(frames)

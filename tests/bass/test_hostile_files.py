@@ -215,7 +215,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     }
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(kind=st.sampled_from(("none", "bz2", "lz4")), data=st.data())
 def test_randomly_damaged_bags(
     good: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, data: st.DataObject

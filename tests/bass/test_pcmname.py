@@ -303,7 +303,7 @@ def assert_harmless(opener: Opener, name: str) -> None:
 
 
 random_names = given(NAMES | st.text("hw:=,.-_aF0\0 '", max_size=30))
-unlimited = partial(settings, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+unlimited = partial(settings, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @unlimited(max_examples=120)

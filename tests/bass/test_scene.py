@@ -89,7 +89,7 @@ def test_both_ears_always_have_sound(walk: np.ndarray) -> None:
     assert levels[:, 1:].min() > 10 ** (-70 / 20)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.lists(st.integers(1, 9000), min_size=1, max_size=6), st.sampled_from([4000, 16000, 44100, 96000]))
 def test_samples_do_not_depend_on_the_chunks(cuts: list[int], rate: int) -> None:
     scene, whole = Scene(rate), Scene(rate).frames(sum(cuts))

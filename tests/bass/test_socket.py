@@ -107,7 +107,7 @@ def test_answer_before_and_at_the_start_of_an_acquisition() -> None:
     assert parse(read_frames(port_content(4, 20), 10, 1))[:4] == (4, 0, 5, [1, 2, 3, 4])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.tuples(st.integers(1, 60), st.integers(1, 60)), min_size=1, max_size=20), st.integers(1, 50))
 def test_a_reader_gets_each_frame_or_the_number_of_lost_frames(steps: list[tuple[int, int]], length: int) -> None:
     last, following, seen, lost = 0, 1, [], 0
@@ -121,7 +121,7 @@ def test_a_reader_gets_each_frame_or_the_number_of_lost_frames(steps: list[tuple
     assert len(seen) + lost == following - 1
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 10**12)), max_size=6), st.data())
 def test_requests_can_be_divided_anywhere(requests: list[tuple[int, int]], data: st.DataObject) -> None:
     text = b"".join(b"Read Port - N %d - nfr %d\n" % request for request in requests)
@@ -161,7 +161,7 @@ def test_malformed_requests(text: bytes, request_: tuple[int, int]) -> None:
     assert list(take_requests(bytearray(text), quiet=False)) == [request_]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.binary(max_size=300), st.integers(-(2**70), 2**70), st.integers(-(2**70), 2**70))
 def test_no_request_gets_a_negative_count(rubbish: bytes, count: int, first: int) -> None:
     inbox = bytearray(rubbish + b"Read Port - N %d - nfr %d\n" % (count, first))

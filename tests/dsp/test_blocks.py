@@ -42,7 +42,7 @@ def process(stage: Stage, block: Any) -> Any:
 @every_mode
 @given(sizes=sizes)
 @example(sizes=[1])
-@settings(max_examples=4, derandomize=True, deadline=None, database=None)
+@settings(max_examples=4, derandomize=True, database=None)
 def test_block_boundaries_have_no_effect(kind: str, parameters: dict[str, Any], sizes: list[int]) -> None:
     signal = noise(kind, SAMPLES)
     whole = single(make(kind, parameters).process(signal))
@@ -77,7 +77,7 @@ def test_whole_chain_sample_by_sample(method: str) -> None:
 
 @pytest.mark.parametrize(("fb_type", "method"), [("gammatone", "dau"), ("gammatone", "bernstein"), ("drnl", "hilbert")])
 @given(sizes=st.lists(st.one_of(st.sampled_from([0, 1]), st.integers(2, 24000)), min_size=2, max_size=8).filter(any))
-@settings(max_examples=4, derandomize=True, deadline=None, database=None)
+@settings(max_examples=4, derandomize=True, database=None)
 def test_blocks_of_up_to_three_seconds(fb_type: str, method: str, sizes: list[int]) -> None:
     rate = 8000.0
     parameters = {

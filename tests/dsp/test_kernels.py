@@ -45,7 +45,7 @@ each_level = pytest.mark.parametrize("level", [2, 3, 4, "aarch64"])
 each_native = pytest.mark.parametrize("level", [2, 3, 4])
 EXAMPLES = "ROSAFE_TEST_EXAMPLES"  # environment variable: their number; the sanitizers need few, but each takes long
 count = int(os.environ.get(EXAMPLES, "10"))
-examples = settings(max_examples=count, derandomize=count <= 10, deadline=None, database=None)
+examples = settings(max_examples=count, derandomize=count <= 10, database=None)
 block_sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2, 3, 64]), st.integers(0, 400)), min_size=1, max_size=8)
 
 

@@ -73,7 +73,6 @@ def test_random_text_is_rejected(world: World) -> None:
     @settings(
         max_examples=400 if LONG else 100,
         derandomize=not LONG,
-        deadline=None,
         database=None,
         suppress_health_check=list(HealthCheck),
     )

@@ -106,13 +106,13 @@ def same(found: Any, value: Any) -> bool:
     return bool(found == value)
 
 
-@settings(deadline=None, max_examples=20, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=20, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(values)
 def test_plain_values_read_back(value: Any) -> None:
     assert same(read(binary_format.plain(value)), value)
 
 
-@settings(deadline=None, max_examples=30, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=30, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(st.lists(st.floats(allow_nan=False), max_size=4), max_size=4), st.booleans())
 def test_signals_read_back(channels: list[list[float]], alike: bool) -> None:
     """One array if all channels have the same number of frames, otherwise nested structures."""

@@ -54,7 +54,7 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 texts = st.text(st.characters(max_codepoint=0xFFFF, blacklist_categories=["Cs"]))
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(texts, max_size=8))
 def test_tcl_reads_words_as_they_were(split: Any, words: list[str]) -> None:
     assert split(" ".join(map(text_formats.tcl_word, words))) == words
@@ -76,7 +76,6 @@ def text_of(form: text_formats.Syntax, idl: str, value: Any) -> str:
 bits = st.binary(min_size=8, max_size=8).map(lambda raw: float(np.frombuffer(raw, "<f8")[0]))
 
 
-@settings(deadline=None)
 @given(st.lists(st.one_of(bits, st.floats(), st.integers(-5, 5).map(float)), max_size=30))
 def test_numbers_come_back_the_same_in_json(numbers: list[float]) -> None:
     text = text_of(JSON, "sequence<double>", np.array(numbers, float))

@@ -179,7 +179,7 @@ values = st.recursive(
 )
 
 
-@settings(deadline=None, max_examples=25, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=25, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(st.data())
 def test_any_input_gets_the_right_types_or_is_rejected(data: st.DataObject) -> None:
     _, service = data.draw(st.sampled_from(list(interface.all_services())))
@@ -200,7 +200,7 @@ def test_any_input_gets_the_right_types_or_is_rejected(data: st.DataObject) -> N
             assert type(value) is kinds.get(parameter.idl, int)
 
 
-@settings(deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(st.text(alphabet='ab {}"\\$[ ', max_size=12))
 def test_tcl_lists_are_split_as_tcl_does(text: str) -> None:
     """Lists with quotes, backslashes or unbalanced braces are not split."""

@@ -82,7 +82,7 @@ def assert_same(got: dict[str, Any], expected: dict[str, Any]) -> None:
 
 @with_kernels
 @given(sizes=sizes, given_parameters=parameters)
-@settings(deadline=None, max_examples=4)
+@settings(max_examples=4)
 def test_all_representations_are_independent_of_blocks(sizes: list[int], given_parameters: dict[str, Any]) -> None:
     options: dict[str, Any] = {"parameters": {**FEW, **given_parameters}, "outputs": sorted(BUILTIN)}
     with at_most(0) as lengths:
@@ -248,7 +248,7 @@ def test_a_branch_for_each_worker(count: int, channels: int, shares: list[int], 
     count=st.integers(2, 5),
     channels=st.integers(9, 40),
 )
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_numbers_are_independent_of_branches(
     given_parameters: dict[str, Any], outputs: set[str], count: int, channels: int
 ) -> None:

@@ -33,7 +33,7 @@ def assert_same(got: dict[str, Any], expected: dict[str, Any]) -> None:
         np.testing.assert_array_equal(value, expected[name], err_msg=name)
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(st.lists(st.integers(1, 900), min_size=1, max_size=5))
 def test_any_blocks_give_the_numbers_of_process(lengths: list[int]) -> None:
     got = joined(rosafe.Stream(RATE, FEW), cut(SOUND, lengths))

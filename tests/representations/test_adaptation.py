@@ -149,7 +149,7 @@ sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2, 31, 32, 33]), st.integers(0
 
 @each_mode
 @given(sizes=sizes)
-@settings(max_examples=10, deadline=None, database=None)
+@settings(max_examples=10, database=None)
 def test_block_boundaries_and_prefixes(signal: SignalFormat, parameters: dict[str, Any], sizes: list[int]) -> None:
     x = sound(400)
     whole = Adaptation(signal, **parameters).process(x)

@@ -188,7 +188,7 @@ sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2]), st.integers(0, 300)), min
 
 @each_mode
 @given(sizes=sizes)
-@settings(max_examples=15, deadline=None, database=None)
+@settings(max_examples=15, database=None)
 def test_block_boundaries_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None:
     x = sound(700)
     whole = Autocorrelation(SOUND, **parameters).process(x)

@@ -225,7 +225,7 @@ sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2]), st.integers(0, 60)), min_
 
 
 @given(sizes=sizes)
-@settings(max_examples=25, deadline=None, database=None)
+@settings(max_examples=25, database=None)
 def test_block_boundaries_and_prefixes(sizes: list[int]) -> None:
     x = rates(100)
     whole = Gabor(given_signal(5)).process(x)

@@ -161,7 +161,7 @@ sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2]), st.integers(0, 90)), min_
 
 
 @given(sizes=sizes, order=st.sampled_from([1, 2, 3, 6, 41, 99]), rate=st.sampled_from([0.4, 10.0]))
-@settings(max_examples=40, deadline=None, database=None)
+@settings(max_examples=40, database=None)
 def test_block_boundaries_and_prefixes(sizes: list[int], order: int, rate: float) -> None:
     def stage() -> Pitch:
         return Pitch(replace(GIVEN, rate=rate), **WIDE, pi_medianOrder=order)

@@ -313,7 +313,7 @@ def joined(blocks: list[tuple[FloatArray, ...]]) -> list[FloatArray]:
 
 @each_mode
 @given(sizes=sizes)
-@settings(max_examples=15, deadline=None, database=None)
+@settings(max_examples=15, database=None)
 def test_block_boundaries_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None:
     x, signal = sound(700, 9), given_signal(9)
     whole = Precedence(signal, **parameters).process(x)

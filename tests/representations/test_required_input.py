@@ -23,7 +23,7 @@ HOPS: tuple[dict[str, float], ...] = (
 
 
 @pytest.mark.parametrize("kind", STAGES)
-@settings(max_examples=3, deadline=None, database=None)
+@settings(max_examples=3, database=None)
 @given(
     sizes=st.lists(st.one_of(st.sampled_from([0, 1, 160]), st.integers(1, 400)), min_size=4, max_size=12),
     hops=st.sampled_from(HOPS),

@@ -233,7 +233,7 @@ def test_declaration() -> None:
 
 
 @pytest.mark.parametrize("level", [2, 3, 4, "aarch64"])
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.integers(1, 9), st.integers(0, 12), st.integers(0, 99), st.floats(1e-3, 1.0), st.sampled_from([0, 40, 140]))
 def test_the_kernel_equals_the_numpy_implementation(
     level: Choice, channels: int, frames: int, seed: int, part: float, wide: int

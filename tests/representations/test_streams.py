@@ -56,7 +56,7 @@ def frames(root: str, number: int, seed: int = 0, channels: int = 5) -> FloatArr
 
 
 @every
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(sizes=block_sizes, seed=st.integers(0, 5))
 def test_block_boundaries_have_no_effect(
     kind: str, root: str, parameters: dict[str, Any], sizes: list[int], seed: int
@@ -68,7 +68,7 @@ def test_block_boundaries_have_no_effect(
 
 
 @every
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(number=st.integers(0, 59))
 def test_a_prefix_gives_a_prefix(kind: str, root: str, parameters: dict[str, Any], number: int) -> None:
     given_frames = frames(root, 60)

@@ -153,7 +153,7 @@ changes = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(parameters, st.integers(0, 99), block_sizes, changes, st.integers(1, 5))
 def test_the_algorithm_in_plain_python(
     values: dict[str, Any], seed: int, sizes: list[int], changes: list[tuple[int, str, Any]], channels: int

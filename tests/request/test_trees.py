@@ -97,7 +97,7 @@ def disturb(model: Model, number: int, what: str) -> None:
             return
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.one_of(REQUESTS, CHANGES), max_size=8))
 def test_any_sequence_of_requests_and_changes(acts: list[tuple[Any, Any]]) -> None:
     model = Model()
@@ -112,7 +112,7 @@ def test_any_sequence_of_requests_and_changes(acts: list[tuple[Any, Any]]) -> No
         assert (again["dependencies"], again["created"]) == (response["dependencies"], [])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(REQUESTS, min_size=2, max_size=5))
 def test_independent_clients(requested: list[tuple[str, dict[str, Any]]]) -> None:
     """Concurrent requests without a lock: each gets its processors, and there are no duplicates."""
@@ -133,7 +133,7 @@ def test_independent_clients(requested: list[tuple[str, dict[str, Any]]]) -> Non
         assert [other for other, state in model.state().items() if state == one] == [name]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(REQUESTS, REQUESTS, st.integers(0, 20), st.booleans(), st.integers(1, 10))
 def test_a_failed_request_leaves_no_processor(
     first: tuple[str, dict[str, Any]], requested: tuple[str, dict[str, Any]], at: int, cancelled: bool, again: int
@@ -488,7 +488,7 @@ _JSON = st.recursive(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.one_of(_JSON, st.dictionaries(_NAMES, _SCALARS).map(lambda form: {**form, "representation": "ild"})))
 def test_any_input_is_accepted_or_rejected(form: Any) -> None:
     try:

@@ -208,11 +208,11 @@ class RingMachine(RuleBasedStateMachine):
             assert getattr(counters, name) == getattr(model, name), name
 
 
-RingMachine.TestCase.settings = settings(max_examples=80, stateful_step_count=30, deadline=None)
+RingMachine.TestCase.settings = settings(max_examples=80, stateful_step_count=30)
 TestRing = RingMachine.TestCase
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     chunks=st.lists(st.integers(1, 12), min_size=1, max_size=30),
     block=st.integers(1, 40),

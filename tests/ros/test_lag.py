@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from rosafe.component.lag import BLOCK_SIZES, LAG_SECONDS, LagMonitor
@@ -49,7 +49,6 @@ def test_a_fast_enough_tree_is_not_reported() -> None:
     assert run(44100, 0.9, 20.0) == []
 
 
-@settings(deadline=None)
 @given(st.sampled_from([1, 10, 100, 220]), st.floats(1.1, 12.0))
 def test_a_too_short_block_is_reported_in_time_with_a_sufficient_size(block: int, load: float) -> None:
     """Here the time for a block does not depend on its length."""

@@ -71,7 +71,7 @@ def ours_and_plain(idl: str, left: np.ndarray, right: np.ndarray | None = None) 
     )
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(data=st.data(), idl=st.sampled_from(sorted(LEVELS)))
 def test_bytes_are_those_of_the_generated_class(data: st.DataObject, idl: str) -> None:
     shape = data.draw(st.tuples(*[st.integers(1, 5)] * (LEVELS[idl] - 1), st.integers(0, 6)))
@@ -113,7 +113,7 @@ def test_the_pieces_of_a_window_are_sent_as_one() -> None:
     assert serialized(ours) == serialized(plain)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     idl=st.sampled_from(sorted(LEVELS)),
     blocks=st.lists(st.integers(1, 40), max_size=6),
@@ -255,7 +255,7 @@ def test_messages_truncated_anywhere_are_rejected(idl: str) -> None:
             serialization.message_class("rosAFE", idl)().deserialize(whole[:length])
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(idl=st.sampled_from([*sorted(LEVELS), AUDIO]), data=st.binary(max_size=120))
 def test_garbage_is_rejected_or_read(idl: str, data: bytes) -> None:
     lenient = serialization.tolerant_message_class("rosAFE", idl, 100)().deserialize(data)

@@ -106,7 +106,7 @@ _SIMPLE = [
 ]
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=40, derandomize=True)
 @given(st.data())
 def test_each_parameter_is_preserved_to_the_last_digit(data: st.DataObject) -> None:
     kind = data.draw(st.sampled_from(_SIMPLE))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -26,7 +26,6 @@ def numbered(rows: tuple[int, ...], sizes: list[int]) -> list[NDArray[np.float64
     return np.split(whole, np.cumsum(sizes)[:-1], axis=-1) if sizes else []
 
 
-@settings(deadline=None)
 @given(ROWS, st.integers(0, 80), SIZES)
 @example((2,), 2 * MAX_PIECES + 50, [1] * (3 * MAX_PIECES))
 @example((2, 3), 2 * MAX_PIECES + 7, [2, 1, 0] * MAX_PIECES)
@@ -46,7 +45,6 @@ def test_a_window_is_the_newest_frames_after_zeros(rows: tuple[int, ...], frames
         np.testing.assert_array_equal(view.array(), expected)
 
 
-@settings(deadline=None)
 @given(ROWS, st.integers(0, 80), st.lists(st.one_of(st.sampled_from("ab"), st.integers(0, 40)), max_size=40))
 @example((2,), 2 * MAX_PIECES + 50, ["a", *[1] * (2 * MAX_PIECES), "a", *[1] * MAX_PIECES, "b", *[1] * 30])
 def test_a_history_returns_the_output_since_the_last_call(
@@ -105,7 +103,6 @@ def test_a_history_is_cleared_by_another_shape_or_another_rate() -> None:
     assert (view.shape, last.lags) == ((3, 4), 5)
 
 
-@settings(deadline=None)
 @given(st.integers(1, 40), SIZES)
 def test_views_of_a_part_and_of_exchanged_rows(frames: int, sizes: list[int]) -> None:
     window = SlidingWindow((2, 3), frames)
@@ -132,7 +129,6 @@ def test_blocks_are_not_copied() -> None:
     assert history.read_new("x").parts[0].pieces[-1] is block
 
 
-@settings(deadline=None)
 @given(ROWS, st.integers(1, 3000), SIZES)
 @example((2,), 2000, [1] * 600)
 @example((64,), 44100, [220] * 400)  # 1 s of sound in blocks of 5 ms
