@@ -198,7 +198,7 @@ MUTATIONS = (
     _node(
         "new-subscriber-forgotten",
         "published_tree.py",
-        "        self._forget_subscribed()\n        self._catch_up()",
+        "        self._ports.forget_subscribed()\n        self._catch_up()",
         "        self._catch_up()",
         "tests/ros/test_ports.py -k short_blocks",
     ),

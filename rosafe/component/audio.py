@@ -95,8 +95,7 @@ class AudioRing:
         with self._arrived:
             if connection is not self._connection:
                 return
-            problem = window_error(message)
-            if problem:
+            if problem := window_error(message):
                 self._refuse(problem)
                 return
             self.counters.messages += 1
@@ -258,11 +257,9 @@ class AudioRing:
     def _is_complete(self, reader: AudioReader, now: float) -> bool:
         """Return whether there are as many unread blocks as `reader` reads at once."""
         unread = self._unread(reader) // reader.frames_per_block
-        if unread < 1:
-            return False
-        reader.planned = reader.combined_blocks()
-        if unread >= reader.planned:
-            return True
+        reader.planned = reader.combined_blocks() if unread >= 1 else 0
+        if not 1 <= unread < reader.planned:
+            return unread >= 1
         return reader.position <= reader.awaited or now - self._arrived_at > PAUSE_SECONDS
 
     def waiting(self, reader: AudioReader) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +12,7 @@ from rosafe.component.component import ComponentNode
 from rosafe.component.frame_clock import LinearClock
 from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError
 from rosafe.node.choice_fallbacks import ChoiceFallbacks
-from rosafe.node.ports import OutputPort, element
+from rosafe.node.ports import OutputPort, OutputPorts, element
 from rosafe.node.processor_health import ProcessorHealth
 from rosafe.transport.publisher import NewestMessage, Publisher
 from rosafe.tree.block import Block
@@ -56,9 +55,7 @@ class PublishedTree:
         self._choices = choices
         self._captured = captured
         self._catch_up = catch_up
-        self._ports: dict[Processor, OutputPort] = {}
-        self._subscribed: tuple[Processor, ...] | None = None  # those with subscribers; None if this may have changed
-        self._subscribed_lock = threading.Lock()
+        self._ports = OutputPorts()
         self._activities: dict[Processor, Activity] = {}
         self._input_port = self._advertise("input")
         self._time_class = serialization.message_class("rosAFE", "::rosAFE::frameTime")
@@ -92,25 +89,17 @@ class PublishedTree:
 
         It is infinite if no port has subscribers, and 0 if each block is needed.
         """
-        if self.tree.is_observed:
+        if self._ports.observed:
             return 0
-        subscribed = self._subscribed
-        if subscribed is None:
-            with self._subscribed_lock:
-                ports = tuple(self._ports.items())
-                subscribed = self._subscribed = tuple(one for one, port in ports if port.has_subscribers)
+        subscribed = self._ports.subscribed
         if not subscribed:
             return 0 if self._frame_time.has_subscribers else math.inf
         if any(processor.signal.hop <= block_frames for processor in subscribed):
             return 0
         return min(map(next_output, subscribed))
 
-    def _forget_subscribed(self) -> None:
-        with self._subscribed_lock:
-            self._subscribed = None
-
     def _on_subscribers_changed(self) -> None:
-        self._forget_subscribed()
+        self._ports.forget_subscribed()
         self._catch_up()
 
     # --- events of the tree, on its threads ---
@@ -122,8 +111,7 @@ class PublishedTree:
         else:
             publisher = self._advertise(processor.kind, processor.name)
             port = OutputPort(processor, publisher, publisher.unregister)
-        self._ports[processor] = port
-        self._forget_subscribed()
+        self._ports.add(processor, port)
         self.health.added(processor, self._meters[processor.kind])
         port.publish()
 
@@ -147,9 +135,8 @@ class PublishedTree:
     def on_removed(self, processor: Processor) -> None:
         """Close the port and end the activity."""
         self.health.ended(processor)
-        port = self._ports.pop(processor, None)  # None if it could not be opened
-        self._forget_subscribed()
-        if port is not None:
+        port = self._ports.remove(processor)
+        if port is not None:  # otherwise it could not be opened
             port.close()
         activity = self._activities.get(processor)
         if activity is not None:

@@ -41,7 +41,7 @@ class Input(Stage):
     def process(self, block: Any, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         """Convert (2, N) of int32 or float to (2, N). NaN and infinities are a ValueError."""
         if type(block) is np.ndarray and block.dtype == np.int32 and block.shape[:-1] == (self.input_format.ears,):
-            scaled: FloatArray = np.divide(block, self._divisor, order="C")  # of a sound card: in one step
+            scaled: FloatArray = np.divide(block, self._divisor, order="C")
             return scaled
         samples = self._as_valid_block(block)
         if np.asarray(block).dtype.kind == "f":  # whole numbers are always finite and within the limit

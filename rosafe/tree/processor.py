@@ -85,7 +85,6 @@ class Processor(StateMachine):
         self.output_buffer_for: Callable[[Block], FloatArray | None] | None = None
         self._context = context
         self._source_reader = None if source is None else SourceReader(self, source, context.workers)
-        self._started = False
         self._publish_seconds = 0.0  # duration of the last call of the listener
         self._publish_lock = threading.Lock()  # `on_released` and `on_removed` exclude each other
 
@@ -151,7 +150,6 @@ class Processor(StateMachine):
         workers = self._context.workers
         with workers.lock:
             workers.add_client(self)  # raises before anything is attached if no thread can be started
-            self._started = True
             self.attach()
             workers.wake()
         if self._source_reader is not None:
@@ -168,8 +166,7 @@ class Processor(StateMachine):
         workers = self._context.workers
         with workers.lock:
             self.remove()
-            if self._started:
-                workers.remove_client(self)
+            workers.remove_client(self)
             workers.wake()
         reader, self._source_reader = self._source_reader, None  # which refers to this processor
         if reader is not None:

@@ -66,11 +66,6 @@ class Tree:
             return self._registry.root
 
     @property
-    def is_observed(self) -> bool:
-        """Whether there are observers, which are to see each block."""
-        return bool(self._context.observers)
-
-    @property
     def failures(self) -> list[Failure]:
         """The processors that failed, oldest first, without those that were created again."""
         with self._requests:

@@ -136,8 +136,9 @@ class Workers:
             raise
 
     def remove_client(self, client: Task) -> None:
-        """Remove a client; the threads end with the last one."""
-        self._clients.remove(client)
+        """Remove a client, if it was added; the threads end with the last one."""
+        if client in self._clients:
+            self._clients.remove(client)
         if not self._clients:
             self._ready, self._last = [], {}
             while self._idle:
