@@ -123,8 +123,12 @@ class HandshakeServer:
             self._wake_writer.send(b"!")
 
     def run(self) -> None:
-        """Serve until the listener is closed."""
-        self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
+        """Serve until the listener is closed; that may be before the call."""
+        try:
+            self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
+        except (OSError, ValueError):
+            if self._listener.fileno() >= 0:
+                raise
         self._selector.register(self._wake_reader, selectors.EVENT_READ, self._resume_idle)
         next_check = 0.0
         while self._listener.fileno() >= 0:

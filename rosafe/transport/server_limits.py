@@ -90,8 +90,15 @@ class TcprosServer(tcpros_base.TCPServer):
     """The port that subscribers and service clients connect to."""
 
     def run(self) -> None:
-        """Serve until the socket is closed."""
-        HandshakeServer(self.server_sock, _header_size, _parse_header, functools.partial(_report, "TCPROS")).run()
+        """Serve until the socket is closed; that may be before this thread begins."""
+        listener = self.server_sock
+        try:
+            server = HandshakeServer(listener, _header_size, _parse_header, functools.partial(_report, "TCPROS"))
+        except OSError:
+            if listener.fileno() >= 0:
+                raise
+        else:
+            server.run()
 
 
 def _header_size(data: bytes | bytearray) -> int | None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from rosafe.transport import handshake_server
+from rosafe.transport import handshake_server, server_limits
 from rosafe.transport.handshake_server import HandshakeRejected, HandshakeServer
 from tests.harness import wait_for
 
@@ -55,6 +55,16 @@ def server() -> Iterator[EchoServer]:
         it.listener.close()
         it.thread.join(20)
         assert not it.thread.is_alive()
+
+
+def test_the_listener_is_closed_before_the_thread_runs() -> None:
+    it = EchoServer()
+    it.listener.close()
+    it.door.run()
+    tcpros = server_limits.TcprosServer(lambda sock, address: None)
+    tcpros.server_sock = it.listener
+    tcpros.run()
+    assert not it.reports
 
 
 def test_data_arrive_completely_and_in_order() -> None:
