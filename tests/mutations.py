@@ -191,8 +191,8 @@ MUTATIONS = (
     _component(
         "early-stamp-ignored",
         "frame_clock.py",
-        "if time >= line.at(frame):",
-        "if True:",
+        "if time < line.at(frame):",
+        "if False:",
         "tests/ros/test_frame_time.py",
     ),
     _node(

@@ -61,10 +61,10 @@ class FrameTime:
             if self._was_set(line, frame, time):
                 self.begin(self._nominal)
             elif same_bin:
-                self._points.pop()
-                if time >= line.at(frame):  # the line is still below all points: it is fitted once per bin
-                    self._points.append((frame, time))
-                    return
+                self._points[-1] = frame, time
+                if time < line.at(frame):  # otherwise the line is still below all points, and is fitted once per bin
+                    self._fitted = None
+                return
         if not self._points:
             self._first = frame
         self._fitted = None

@@ -37,6 +37,7 @@ _SIGNALS = {idl: len(levels) for idl, levels in LEVELS.items()}
 _COUNT = struct.Struct("<I")
 _MAX_RECORD = 2**31 - 1  # bytes; the limit of numpy's layouts
 MAX_KEPT_BYTES = 2**18  # of the bytes of a window that are kept with it
+MAX_TEMPLATE_BYTES = 2**16  # of a template that is kept
 ROW_BYTES = 4096  # shorter rows of the pieces of a window are copied together, which is faster than one by one
 
 
@@ -67,8 +68,7 @@ class _Template(NamedTuple):
     strides: tuple[int, ...]  # bytes
 
 
-@functools.lru_cache(maxsize=256)
-def _template(shape: tuple[int, ...]) -> _Template:
+def _new_template(shape: tuple[int, ...]) -> _Template:
     record = np.zeros((), nested_dtype(shape))
     level = record
     for length in shape:
@@ -78,11 +78,20 @@ def _template(shape: tuple[int, ...]) -> _Template:
     return _Template(record.reshape(1).view(np.uint8), offset, level.strides)
 
 
+_template = functools.lru_cache(maxsize=64)(_new_template)
+
+
 def _pack_nested(view: WindowView) -> memoryview:
     """Return the bytes of a signal of shape (..., frames), each level preceded by its count."""
     shape = view.shape
-    template = _template(shape)
-    record = template.record.copy()
+    if nested_dtype(shape).itemsize <= MAX_TEMPLATE_BYTES:
+        template = _template(shape)
+        record = template.record.copy()
+    else:
+        template = _new_template(shape)
+        record = template.record
+    if 0 in shape:  # counts alone
+        return record.data
     view.copy_to(np.ndarray(shape, _SAMPLES["double"], record.data, template.offset, template.strides))
     return record.data
 
@@ -321,9 +330,10 @@ def _with_arrays(component: interface.ComponentSpec, generated: type[Any], membe
     """Return a subclass of a generated class that serializes arrays."""
     parts = _parts_of_message(component, members)
     decode = _members_decoder(component, members)
+    names = {name for name, _ in members}
 
     def create(self: Any, *values: Any, **fields: Any) -> None:
-        if len(fields) != len(members):
+        if values or fields.keys() != names or any(value is None for value in fields.values()):
             generated.__init__(self, *values, **fields)
             return
         for name, value in fields.items():  # without defaults, whose creation takes longer

@@ -98,7 +98,7 @@ class PublishedTree:
             return 0
         return min(map(next_output, subscribed))
 
-    def _on_subscribers_changed(self) -> None:
+    def _on_connection(self) -> None:
         self._ports.forget_subscribed()
         self._catch_up()
 
@@ -145,5 +145,6 @@ class PublishedTree:
     def _advertise(self, kind: str, name: str = "") -> Publisher:
         message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
         publisher = self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
-        publisher.impl.on_subscribers_changed = self._on_subscribers_changed
+        publisher.impl.on_connection = self._on_connection
+        publisher.impl.on_disconnection = self._ports.forget_subscribed
         return publisher

@@ -14,7 +14,7 @@ class BufferList:
 
     def write(self, data: Any, /) -> None:
         """Append the bytes of a contiguous buffer."""
-        size = len(data) if isinstance(data, bytes) else data.nbytes
+        size = len(data) if isinstance(data, (bytes, bytearray)) else data.nbytes
         if size:
             self.pieces.append(data)
             self.size += size

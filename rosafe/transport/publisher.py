@@ -88,7 +88,8 @@ class _Topic(topics._PublisherImpl):
 
     def __init__(self, name: str, data_class: Any) -> None:
         super().__init__(name, data_class)
-        self.on_subscribers_changed: Callable[[], None] = lambda: None  # called after each change
+        self.on_connection: Callable[[], None] = lambda: None  # called for each new subscriber
+        self.on_disconnection: Callable[[], None] = lambda: None  # called with locks of rospy held
         self.connection_poll.poller.close()
         self.connection_poll = _Poller()
 
@@ -112,14 +113,14 @@ class _Topic(topics._PublisherImpl):
                 raise
             return False
         finally:
-            self.on_subscribers_changed()
+            self.on_connection()
             if self.closed:  # meanwhile; rospy would leave the subscriber waiting
                 sender.end()
 
     def remove_connection(self, connection: Any) -> None:
         """Remove a subscriber; rospy's method also notifies listeners, which are not used, and fails at shutdown."""
         topics._TopicImpl.remove_connection(self, connection)
-        self.on_subscribers_changed()
+        self.on_disconnection()
 
     def publish(self, message: Any, connection_override: Any = None) -> None:
         """Keep `message` for later subscribers, and send it to the present ones (or to one connection)."""

@@ -40,6 +40,7 @@ def delays(kind: str, count: int, random: np.random.Generator) -> np.ndarray:
     ("kind", "skew", "chunk", "per_block"),
     [
         ("none", 0.0, 2205, 5),
+        ("none", 80e-6, 441, 2),  # each stamp is the earliest of its bin
         ("plain", 80e-6, 2205, 5),
         ("spikes", -80e-6, 2205, 5),
         ("bursts", 80e-6, 2205, 1),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import time
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,30 @@ def test_types_are_those_of_the_generated_class(idl: str) -> None:
 @pytest.mark.parametrize("idl", sorted(LEVELS))
 def test_a_message_created_without_arrays_can_be_sent(idl: str) -> None:
     assert serialized(serialization.message_class("rosAFE", idl)()) == serialized(plain_class(idl)())
+
+
+@pytest.mark.parametrize("idl", sorted(LEVELS))
+def test_empty_and_long_signals(idl: str) -> None:
+    """A received message with an absent signal can be sent again."""
+    default = serialized(plain_class(idl)())
+    assert serialized(serialization.message_class("rosAFE", idl)().deserialize(default)) == default
+    long = {1: (20_000,), 2: (3000, 5), 3: (30, 100, 5)}[LEVELS[idl]]
+    for shape in [*itertools.product((0, 1, 3), repeat=LEVELS[idl]), long]:
+        if shape[:1] == (0,) and LEVELS[idl] > 1:
+            continue  # absent
+        ours, plain = ours_and_plain(idl, np.random.default_rng(1).normal(size=shape))
+        assert serialized(ours) == serialized(plain), shape
+
+
+@pytest.mark.parametrize(
+    "fields", [{"left": np.ones((2, 3))}, {**HEADS[TIME_FREQUENCY], "left": np.ones((2, 3)), "right": None}]
+)
+def test_missing_fields_get_the_defaults_of_the_generated_class(fields: dict[str, Any]) -> None:
+    message_class = serialization.message_class("rosAFE", TIME_FREQUENCY)
+    received = message_class().deserialize(serialized(message_class(**fields)))
+    assert received.right.shape == (0, 0) and received.sampleRate == fields.get("sampleRate", 0)
+    with pytest.raises(AttributeError, match="sampelRate"):
+        message_class(sampelRate=1, lastFrameIndex=1, framesOnPort=1, numberOfChannels=1, left=[], right=[])
 
 
 def test_the_pieces_of_a_window_are_sent_as_one() -> None:
