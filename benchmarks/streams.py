@@ -105,7 +105,7 @@ def play(trees: int, block: int, seconds: float, cores: list[int], begin: float)
                 nFramesPerChunk=block,
                 left=noise[0],
                 right=noise[1],
-                stamp=SimpleNamespace(sec=0, nsec=0),
+                stamp={"sec": 0, "nsec": 0},
             )
         )
 
