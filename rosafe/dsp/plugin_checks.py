@@ -328,9 +328,7 @@ class CheckedStage(Stage):
         """Check all members that can be read without a block."""
         if not {"input_format", "values", "provide", "provided"} <= vars(self).keys():
             raise self._violation("__init__: expected a call of super().__init__(input_format, **parameters)")
-        if not isinstance(self.output_format, SignalFormat):
-            raise self._violation(f"output_format: expected a SignalFormat, got {type(self.output_format).__name__}")
-        for name in ("parameters", "derived", "required_extra", "look_ahead"):
+        for name in ("output_format", "parameters", "derived", "required_extra", "look_ahead"):
             getattr(self, name)
 
     @property
@@ -342,6 +340,14 @@ class CheckedStage(Stage):
     def derived(self) -> dict[str, Any]:
         with self._locating("derived"):
             return _values(super().derived, self.REPRESENTATION.derived, "derived")
+
+    @property
+    def output_format(self) -> SignalFormat:
+        with self._locating("output_format"):
+            found = super().output_format
+            if not isinstance(found, SignalFormat):
+                raise TypeError(f"output_format: expected a SignalFormat, got {type(found).__name__}")
+            return found
 
     @property
     def required_extra(self) -> str:

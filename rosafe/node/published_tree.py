@@ -94,7 +94,8 @@ class PublishedTree:
         subscribed = self._ports.subscribed
         if not subscribed:
             return 0 if self._frame_time.has_subscribers else math.inf
-        if any(processor.signal.hop <= block_frames for processor in subscribed):
+        released = [processor.last_block for processor in subscribed]
+        if any(block is None or block.signal.hop <= block_frames for block in released):
             return 0
         return min(map(next_output, subscribed))
 

@@ -38,6 +38,14 @@ PLUGINS = {
     "hangs": Fault(
         PLAIN, gated("free", "while not self.os.path.exists(self.gate):", "    np.sort(block)", "return block * 2"), ""
     ),
+    "formless": Fault(
+        PLAIN,
+        gated("formless", "return block * 2")
+        + "\n\n    @property\n    def output_format(self):"
+        + "\n        if self.os.path.exists(self.gate):\n            raise OSError('no format')"
+        + "\n        return self.input_format",
+        "",
+    ),
     "moody": Fault(
         PLAIN,
         gated("moody", "return block * 2")
@@ -157,6 +165,20 @@ def test_a_stage_that_does_not_return_is_reported_and_blocks_no_other(world: wor
     world.http.call("rosAFE/removeProcessor", ["stuck"])
     assert "stuck" not in names(world)
     (folder / "free").touch()
+
+
+def test_a_format_that_fails_ends_its_processor_alone(world: worlds.World, folder: Path) -> None:
+    """Its port has a subscriber, so that its next frame decides when blocks are processed."""
+    make(world, "formless", "rigid", "ratemap_0")
+    with world.graph.start("rostopic", "echo", "/rosAFE/formlessPort/rigid/framesOnPort") as subscriber:
+        wait_for(lambda: subscriber.out, what=lambda: str(subscriber))
+        (folder / "formless").touch()
+        failure = r"\[ERROR\].*rigid \(formless\) failed: plugin formless .*output_format: OSError: no format"
+        wait_for(lambda: re.search(failure, log(world)), what=lambda: log(world))
+    assert "rigid" not in names(world)
+    assert "bad callback" not in log(world)
+    index = newest(world, "ratemap_0")
+    wait_for(lambda: newest(world, "ratemap_0") > index + 5 * 2000)
 
 
 def test_values_that_cannot_be_reported_affect_no_other_processor(world: worlds.World, folder: Path) -> None:
