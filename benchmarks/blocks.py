@@ -76,6 +76,8 @@ def main() -> int:
     if options.seconds <= 0 or min(*options.blocks, options.rounds) < 1:
         parser.error("--seconds: above 0; --blocks, --rounds: at least 1")
     page = Report(options, "Blocks")
+    page.say(f"* medians of {options.rounds} measurements of {options.seconds:g} s")
+    page.say()
     found: list[list[str]] = []
     reference: list[float] = []
     for block in options.blocks:

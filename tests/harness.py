@@ -97,6 +97,24 @@ def wait_for(condition: Callable[[], T], timeout: float = PATIENCE, what: str | 
         pause = min(1.1 * pause, 0.05)  # long waits poll less often, to leave processor time for the rest
 
 
+def freeze(pid: int) -> None:
+    """Stop a process by SIGSTOP, and wait until all its threads have stopped: on a busy machine that takes a while.
+
+    Without /proc this cannot be waited for.
+    """
+    os.kill(pid, signal.SIGSTOP)
+    threads = Path("/proc", str(pid), "task")
+    if threads.exists():
+        wait_for(lambda: all(_state(thread) == "T" for thread in threads.iterdir()), what=f"the stop of process {pid}")
+
+
+def _state(thread: Path) -> str:
+    try:
+        return (thread / "stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:  # it has ended meanwhile
+        return ""
+
+
 def free_port() -> int:
     """Return an unused TCP port of the loopback interface.
 

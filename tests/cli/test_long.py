@@ -14,7 +14,7 @@ import soundfile
 
 from rosafe import load, process
 from tests.cli.command import ROSAFE, environment, noise, rosafe, start, write
-from tests.harness import ROOT, proc, wait_for
+from tests.harness import ROOT, freeze, proc, wait_for
 from tests.terminal import Terminal
 
 pytestmark = pytest.mark.long
@@ -170,7 +170,7 @@ def test_two_commands_for_one_output(long_file: Path) -> None:
     with start("process", "in.wav", "--outputs", "ild", cwd=here) as command:
         wait_for(begun(part), what=lambda: str(command))
         (child,) = _children(command.pid)
-        os.kill(child, signal.SIGSTOP)  # it has opened the file and leaves the processor to others
+        freeze(child)  # it has opened the file and leaves the processor to others
         done = rosafe("process", "in.wav", "--outputs", "ild", cwd=here)
         os.kill(child, signal.SIGCONT)
         assert done.returncode == 1

@@ -71,7 +71,7 @@ def test_a_component_that_hangs_does_not_delay_others(empty_world: World) -> Non
     world = empty_world
     with world.graph.node("bass-ros") as bass, world.graph.node("rosAFE-ros"):
         world.http.call("bass/Stop")
-        bass_signal(bass, signal.SIGSTOP)
+        harness.freeze(bass.pid)
         answers: list[object] = []
         caller = threading.Thread(target=lambda: answers.append(world.http.call("bass/Stop")))
         caller.start()
@@ -130,7 +130,7 @@ def away(master: harness.MasterProcess, how: str) -> Iterator[None]:
         master.kill()
         yield
         return
-    os.kill(master.process.pid, signal.SIGSTOP)
+    harness.freeze(master.process.pid)
     try:
         yield
     finally:
@@ -260,7 +260,7 @@ def test_every_request_is_answered(empty_world: World, tmp_path: Path) -> None:
         harness.wait_for(lambda: hasty.http.raw("/load/bass")[0] == 200)
         number = hasty.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
         assert hasty.http.status(number) == {"id": number, "status": "sent"}
-        bass_signal(bass, signal.SIGSTOP)
+        harness.freeze(bass.pid)
         with ThreadPoolExecutor() as pool:
             answers = pool.map(hasty.http.raw, ("/call/bass/Stop", "/call/bass/ListDevices"))
         for status, reason in answers:

@@ -213,15 +213,19 @@ def test_posterior_sources_and_truth_share_a_column(world: World) -> None:
     peaks = np.array(view["azimuths"])[posterior.argmax(axis=0)]
     assert np.abs(peaks - sources[0, 1]).max() <= 2.6
     assert np.ptp(truth[0]) > 36  # of the scene, in at least 1.5 s
-    scene, errors = Scene(16000, seconds=5.0), list[float]()
+    times = []
     for first, stride, end, values in pieces:
-        times = end - (values.shape[1] - np.arange(values.shape[1])) / view["rate"]
-        assert stride == 1 and abs(first / view["rate"] - times[0]) < 0.11
-        known = np.isfinite(values[104])
-        errors.extend(np.abs(values[104] - scene.azimuth(times + 0.05))[known])
-    # A column lasts 0.1 s, in which the source moves by 3.6 degrees. On a busy machine the clock of the audio is less
-    # exact, so that a message may belong to the next column; the page fills the one before it with the same values.
-    assert np.median(errors) < 2.7 and max(errors) < 8
+        times.append(end - (values.shape[1] - np.arange(values.shape[1])) / view["rate"])
+        assert stride == 1 and abs(first / view["rate"] - times[-1][0]) < 0.11
+    columns = np.concatenate([piece[3] for piece in pieces], axis=1)
+    known = np.isfinite(columns[104])
+    errors = np.abs(columns[104] - Scene(16000, seconds=5.0).azimuth(np.concatenate(times) + 0.05))[known]
+    # On a busy machine a column may have no message of its own. The page fills it with the values of the next one.
+    same = (columns[:, 1:] == columns[:, :-1]) | np.isnan(columns[:, 1:] + columns[:, :-1])
+    filled = np.append(same.all(axis=0), False)[known]
+    assert np.median(errors) < 2.7 and filled.mean() < 0.2
+    assert errors[~filled].max() < 4.5, "a column lasts 0.1 s, in which the source moves by 3.6 degrees"
+    assert errors[filled].max(initial=0.0) < 8.1, "of the next column"
 
 
 def test_unsuitable_messages_of_a_localizer_are_ignored() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import os
 import re
-import signal
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,7 +17,7 @@ from std_msgs.msg import Bool
 
 from rosafe.localizer_node.settings import read_settings
 from rosafe.ros import array_msg
-from tests.harness import PATIENCE, Graph, Process, wait_for
+from tests.harness import PATIENCE, Graph, Process, freeze, wait_for
 from tests.localizer_node.session import Localizer, acquire, names_of, running_localizer, scene_file
 
 SCENE = "sample_rate: 16000\nsources:\n  - {{name: talker, file: {file}, loop: true, azimuth: 40}}\n"
@@ -236,7 +235,7 @@ def test_rosafe_hangs_and_is_killed(graph: Graph, bass: Process, device: str, sp
     with running_localizer(graph, "--head", str(sphere_model), "--rosafe", "victim", name="third") as localizer:
         with graph.node("rosAFE-ros", "-i", "victim") as victim:
             wait_for(lambda: names_of(graph, "victim"))  # in the middle of the requests
-            os.kill(victim.pid, signal.SIGSTOP)
+            freeze(victim.pid)
             localizer.wait_silent()
             victim.stop(9)
         localizer.state(lambda entries: entries["level"] == "1" and "waiting for rosAFE" in entries["message"])

@@ -16,7 +16,7 @@ import rosservice
 from actionlib_msgs.msg import GoalStatus
 
 from rosafe.interface import CORE_REPRESENTATIONS, MAX_ACTIVITIES
-from tests.harness import Graph, Process, proc, run_together, wait_for
+from tests.harness import Graph, Process, freeze, proc, run_together, wait_for
 from tests.ros.session import Session, error_of, noise, own_node, reader
 
 BLOCK = 2000
@@ -32,7 +32,7 @@ def test_a_subscriber_that_stops_reading_does_not_block_others(afe: Session) -> 
     microphone = afe.build("PreProc", "GammatoneProc", block=BLOCK, fb_nChannels=16)
     topic = afe.topic("gammatone")
     with reader(afe.graph, topic) as stuck, reader(afe.graph, topic) as well:
-        os.kill(stuck.pid, signal.SIGSTOP)
+        freeze(stuck.pid)
         for block in range(1, 13):
             microphone.play(noise(BLOCK))
             reads(well, block * BLOCK + 1)
@@ -164,7 +164,7 @@ def test_random_requests_of_eight_clients(afe: Session) -> None:
 def test_many_clients_can_connect_at_the_same_time(afe: Session) -> None:
     """While the node cannot accept them (here: stopped), the system completes their connections."""
     address = urlsplit(rosservice.get_service_uri("/rosAFE/getParameters"))
-    os.kill(afe.process.pid, signal.SIGSTOP)
+    freeze(afe.process.pid)
     try:
         with ExitStack() as stack:
             for _ in range(40):  # with rospy's own backlog, the sixth would have to retry after a second

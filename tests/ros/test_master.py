@@ -16,7 +16,7 @@ from rospy.impl.registration import Registration
 
 from rosafe.transport import registration
 from rosafe.transport.succession import Succession
-from tests.harness import PYTHON, ROOT, Graph, MasterProcess, wait_for
+from tests.harness import PYTHON, ROOT, Graph, MasterProcess, freeze, wait_for
 
 
 def kill(graph: Graph, master: MasterProcess) -> Callable[[], None]:
@@ -29,7 +29,7 @@ def hang(graph: Graph, master: MasterProcess) -> Callable[[], None]:
     """Stop the master, so that clients wait for an answer. Return a function that continues it."""
     assert master.process is not None
     pid = master.process.pid
-    os.kill(pid, signal.SIGSTOP)
+    freeze(pid)
     return lambda: os.kill(pid, signal.SIGCONT)
 
 

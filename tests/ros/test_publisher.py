@@ -28,7 +28,7 @@ from rosafe.ros import array_msg
 from rosafe.transport import publisher
 from rosafe.transport.buffer_list import BufferList
 from rosafe.transport.publisher import MAX_QUEUED, MAX_QUEUED_BYTES, NewestMessage, Publisher, send_pieces
-from tests.harness import PATIENCE, PYTHON, ROOT, Graph, Process, proc, wait_for
+from tests.harness import PATIENCE, PYTHON, ROOT, Graph, Process, freeze, proc, wait_for
 from tests.ros.session import Session, noise, own_node
 
 TIME_DOMAIN = rosAFE.msg.rosAFE_TimeDomainSignalPortStruct
@@ -352,7 +352,7 @@ def test_a_stopped_subscriber_of_22_megabytes_affects_no_other(tree: Session) ->
         assert tree.connections(large) == 2
         play(tree, 2)
         for subscriber in (going, killed):
-            os.kill(subscriber.pid, signal.SIGSTOP)
+            freeze(subscriber.pid)
         play(tree, 3)
         before = resident(tree.process.pid)
         index = play(tree, 20)  # receives each block of ILD

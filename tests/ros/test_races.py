@@ -17,7 +17,7 @@ import pytest
 import rosgraph
 
 from rosafe.transport import master
-from tests.harness import PYTHON, Graph, MasterProcess, python_path, run_together, wait_for
+from tests.harness import PYTHON, Graph, MasterProcess, freeze, python_path, run_together, wait_for
 from tests.ros.session import Session, error_of
 
 # --- two simultaneous inputs ---------------------------------------------------------------------------------------
@@ -114,7 +114,7 @@ def test_a_new_master_with_one_registration_gets_all_others(private_graph: tuple
     with graph.node("bass-ros") as process:
         services = graph.services()
         address = rosgraph.Master("/test", master_uri=graph.uri).lookupNode("/bass")
-        os.kill(process.pid, signal.SIGSTOP)
+        freeze(process.pid)
         try:
             master_process.kill()
             master_process.start(graph.env)

@@ -11,7 +11,7 @@ import numpy as np
 import rospy
 
 from rosafe.component import serialization
-from tests.harness import run_together, wait_for
+from tests.harness import freeze, run_together, wait_for
 from tests.ros.session import error_of, reader
 from tests.soak.world import NAMES, World, following, wait_out
 
@@ -30,7 +30,7 @@ CHANGES = [
 def subscriber_dies(world: World, chance: random.Random) -> None:
     """A subscriber of the largest messages is stopped and then killed."""
     with reader(world.graph, world.afe.topic("gammatone")) as process:
-        os.kill(process.pid, signal.SIGSTOP)
+        freeze(process.pid)
         index = world.afe.read("input").lastFrameIndex
         wait_for(lambda: world.afe.read("input").lastFrameIndex > index + 2 * world.size.block)
         os.kill(process.pid, signal.SIGKILL)

@@ -25,7 +25,7 @@ from rosafe.transport import registration
 from rosafe.tree.sliding_window import SlidingWindow, frames_in
 from tests import harness
 from tests.genomix.world import Http, genomixd
-from tests.harness import free_port, proc, run_together, wait_for
+from tests.harness import free_port, freeze, proc, run_together, wait_for
 from tests.ros.session import Session, assert_holds
 
 NAMES = {kind: ROSAFE.service(entry.request).parameter("name").default for kind, entry in CORE_REPRESENTATIONS.items()}
@@ -299,7 +299,7 @@ class World:
     @contextmanager
     def held(self, process: harness.Process) -> Iterator[None]:
         """Stop a process inside the `with` block."""
-        os.kill(process.pid, signal.SIGSTOP)
+        freeze(process.pid)
         try:
             yield
         finally:
