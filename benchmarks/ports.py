@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import io
 import itertools
+import math
 import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import graph
@@ -119,7 +120,7 @@ def count(topic: str, indexes: list[int], block: int, window: int) -> Port:
 
 
 class Run(NamedTuple):
-    """The result of one run; memory in MB, after `SETTLE_SECONDS` and at the end."""
+    """The result of one run; least memory in MB, in the first and the last quarter after `SETTLE_SECONDS`."""
 
     ports: list[Port]
     node: tuple[float, float]
@@ -136,6 +137,15 @@ class Run(NamedTuple):
         return max(last - first for first, last in (self.node, self.subscriber))
 
 
+def least_memory(pids: Sequence[int], seconds: float) -> list[float]:
+    """Return the least memory of each process in MB during some seconds: that without messages that wait to be sent."""
+    end, least = time.monotonic() + seconds, [math.inf] * len(pids)
+    while time.monotonic() < end:
+        least = [min(one, graph.resident(pid)) for one, pid in zip(least, pids, strict=True)]
+        time.sleep(0.05)
+    return least
+
+
 def run(bench: graph.Bench, block: int, port_seconds: float, seconds: float) -> Run:
     """Subscribe to all ports of the running tree from another process for `seconds`."""
     topics = [graph.topic(kind) for kind in CORE_REPRESENTATIONS]
@@ -143,9 +153,10 @@ def run(bench: graph.Bench, block: int, port_seconds: float, seconds: float) -> 
     pids = bench.pid("/rosAFE"), reader.child.process.pid
     settling = min(SETTLE_SECONDS, seconds / 2)
     time.sleep(settling)
-    before = [graph.resident(pid) for pid in pids]
-    time.sleep(seconds - settling)
-    node, subscriber = zip(before, [graph.resident(pid) for pid in pids], strict=True)
+    quarter = (seconds - settling) / 4
+    before = least_memory(pids, quarter)
+    time.sleep(2 * quarter)
+    node, subscriber = zip(before, least_memory(pids, quarter), strict=True)
     received = reader.close()
     window = round(port_seconds * graph.RATE)
     return Run([count(t, [int(index) for index, _ in received[t]], block, window) for t in topics], node, subscriber)
