@@ -272,7 +272,7 @@ class AudioRing:
         with self._arrived:
             late = [reader for reader in self._readers if self._unread(reader) >= reader.frames_per_block]
             for reader in late:
-                reader.awaited = self._frames.newest
+                reader.awaited, reader.planned = self._frames.newest, 0
         for reader in late:
             reader.wake()
         return bool(late)

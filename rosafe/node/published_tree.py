@@ -99,10 +99,6 @@ class PublishedTree:
             return 0
         return min(map(next_output, subscribed))
 
-    def _on_connection(self) -> None:
-        self._ports.forget_subscribed()
-        self._catch_up()
-
     # --- events of the tree, on its threads ---
 
     def on_added(self, processor: Processor) -> None:
@@ -146,6 +142,6 @@ class PublishedTree:
     def _advertise(self, kind: str, name: str = "") -> Publisher:
         message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
         publisher = self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
-        publisher.impl.on_connection = self._on_connection
-        publisher.impl.on_disconnection = self._ports.forget_subscribed
+        publisher.impl.on_connection = self._catch_up
+        publisher.impl.on_subscribers_changed = self._ports.forget_subscribed
         return publisher

@@ -517,6 +517,12 @@ def test_unobserved_blocks_are_read_together() -> None:
     assert woken[5:] == [128, 132, 136, 140]
     assert [read(), read(), read()] == [8, 8, 0]
     assert got == [source.sample(frame) for frame in range(1, 137)]
+    observed = False
+    play(24)
+    assert reader.waiting
+    observed = True  # by a new subscriber, which gets each block that has arrived
+    assert ring.catch_up()
+    assert [read(), read(), read(), read()] == [8, 8, 8, 0]
     observed, source.index = False, 20  # a new stream, whose frames were not awaited
     feed(source.message())
     assert reader.waiting
