@@ -16,7 +16,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import graph
@@ -27,7 +27,8 @@ from rosafe.component import generate
 from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.transport.buffer_list import BufferList
 
-SETTLE_SECONDS = 5.0  # after this time windows and buffers are full, and memory is measured
+SETTLE_SECONDS = 5.0  # after this time windows and buffers are full
+UNSUBSCRIBED_SECONDS = 2.0  # in this time the node ends a connection and drops the messages that wait for it
 MAX_GROWTH = 64.0  # MB; the leak of one window would exceed this
 
 
@@ -120,7 +121,11 @@ def count(topic: str, indexes: list[int], block: int, window: int) -> Port:
 
 
 class Run(NamedTuple):
-    """The result of one run; least memory in MB, in the first and the last quarter after `SETTLE_SECONDS`."""
+    """The result of one run; least memory in MB.
+
+    That of the node is measured before and after the subscription, when no message waits to be sent; that of the
+    subscriber in the first and the last quarter of the time after `SETTLE_SECONDS`.
+    """
 
     ports: list[Port]
     node: tuple[float, float]
@@ -137,29 +142,39 @@ class Run(NamedTuple):
         return max(last - first for first, last in (self.node, self.subscriber))
 
 
-def least_memory(pids: Sequence[int], seconds: float) -> list[float]:
-    """Return the least memory of each process in MB during some seconds: that without messages that wait to be sent."""
-    end, least = time.monotonic() + seconds, [math.inf] * len(pids)
+def least_memory(pid: int, seconds: float) -> float:
+    """Return the least memory of a process in MB during some seconds."""
+    end, least = time.monotonic() + seconds, math.inf
     while time.monotonic() < end:
-        least = [min(one, graph.resident(pid)) for one, pid in zip(least, pids, strict=True)]
+        least = min(least, graph.resident(pid))
         time.sleep(0.05)
     return least
 
 
 def run(bench: graph.Bench, block: int, port_seconds: float, seconds: float) -> Run:
-    """Subscribe to all ports of the running tree from another process for `seconds`."""
+    """Subscribe to all ports of the running tree from another process for `seconds`.
+
+    An earlier subscription makes the buffers for serialization, which do not count as growth.
+    """
     topics = [graph.topic(kind) for kind in CORE_REPRESENTATIONS]
+    node = bench.pid("/rosAFE")
+    earlier = bench.subscribe(topics)
+    time.sleep(SETTLE_SECONDS)
+    earlier.close()
+    node_before = least_memory(node, UNSUBSCRIBED_SECONDS)
+
     reader = bench.subscribe(topics)
-    pids = bench.pid("/rosAFE"), reader.child.process.pid
-    settling = min(SETTLE_SECONDS, seconds / 2)
+    pid, settling = reader.child.process.pid, min(SETTLE_SECONDS, seconds / 2)
     time.sleep(settling)
     quarter = (seconds - settling) / 4
-    before = least_memory(pids, quarter)
+    first = least_memory(pid, quarter)
     time.sleep(2 * quarter)
-    node, subscriber = zip(before, least_memory(pids, quarter), strict=True)
+    last = least_memory(pid, quarter)
     received = reader.close()
+
     window = round(port_seconds * graph.RATE)
-    return Run([count(t, [int(index) for index, _ in received[t]], block, window) for t in topics], node, subscriber)
+    ports = [count(topic, [int(index) for index, _ in received[topic]], block, window) for topic in topics]
+    return Run(ports, (node_before, least_memory(node, UNSUBSCRIBED_SECONDS)), (first, last))
 
 
 def report(page: Report, result: Run) -> None:
