@@ -121,10 +121,10 @@ def count(topic: str, indexes: list[int], block: int, window: int) -> Port:
 
 
 class Run(NamedTuple):
-    """The result of one run; least memory in MB.
+    """The result of one run; least memory in MB, at the beginning and at the end.
 
-    That of the node is measured before and after the subscription, when no message waits to be sent; that of the
-    subscriber in the first and the last quarter of the time after `SETTLE_SECONDS`.
+    The memory of the node is measured before and after the subscription, while no message waits to be sent. The memory
+    of the subscriber is measured during the subscription.
     """
 
     ports: list[Port]
