@@ -125,6 +125,28 @@ class Reference:
         return f"@{self.kind}{{{self.key},\n{lines}\n}}"
 
 
+_ENTRY = re.compile(r"@(\w+)\{(\w+),\n(.*?)\n\}", re.DOTALL)
+_FIELD = re.compile(r"^  (\w+) = \{(.*)\},?$", re.MULTILINE)
+
+
+def from_bibtex(text: str) -> Iterator[Reference]:
+    """Yield the entries of a text in the form of `Reference.bibtex`: one field on each line, its value in braces."""
+    for kind, key, body in _ENTRY.findall(text):
+        fields = dict(_FIELD.findall(body))
+        yield Reference(
+            key,
+            kind,
+            fields["author"],
+            int(fields["year"]),
+            re.sub("[{}]", "", fields["title"]),
+            fields[_PUBLISHED_IN[kind]],
+            fields.get("volume", ""),
+            fields.get("pages", "").replace("--", "-"),
+            fields.get("doi", ""),
+            fields.get("number" if kind == "techreport" else "note", ""),
+        )
+
+
 @dataclass(frozen=True)
 class Citation:
     """A reference of a representation.

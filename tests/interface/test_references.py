@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from rosafe import plugin
+from rosafe.declarations import literature
 from rosafe.declarations.literature import DAU_1996, LITERATURE, YOUNG_2006
 from rosafe.declarations.reference import Citation, Reference
 from rosafe.interface import KINDS, citation_file, citing
@@ -74,19 +75,19 @@ def test_texts() -> None:
     assert LITERATURE["kollmeier1994"].label == "Kollmeier and Koch (1994)"
 
 
-@pytest.mark.parametrize("key", LITERATURE)
-def test_bibtex_is_complete(key: str) -> None:
-    reference = LITERATURE[key]
-    match = ENTRY.fullmatch(reference.bibtex)
-    assert match and match[1] == reference.kind and match[2] == key
-    fields = dict(re.findall(r"  (\w+) = \{(.*)\}", match[3]))
-    assert fields["year"] == str(reference.year)
-    assert fields["author"] == reference.authors
-    assert fields["title"].replace("{", "").replace("}", "") == reference.title
-    assert fields.get("doi", "") == reference.doi
-    assert reference.bibtex.count("{") == reference.bibtex.count("}")
-    if reference.kind == "article":
-        assert fields["journal"] and fields["volume"] and fields["pages"]
+def test_the_literature_is_read_and_written_without_a_change() -> None:
+    file = (ROOT / "rosafe" / "declarations" / "literature.bib").read_text("utf-8")
+    assert citing.bibtex(LITERATURE[key] for key in sorted(LITERATURE)) == file
+    assert len(LITERATURE) == file.count("@") > 40
+    assert DAU_1996.title.endswith("of the 'effective' signal processing in the auditory system. I. Model structure")
+    assert DAU_1996.pages == "3615-3622"
+    for one in LITERATURE.values():
+        assert one.kind != "article" or (one.published_in and one.volume and one.pages)
+
+
+def test_a_missing_entry_is_an_import_error() -> None:
+    with pytest.raises(AttributeError, match=r"expected a key of literature\.bib in the form DAU_1996, got DAU_1066"):
+        _ = literature.DAU_1066
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,7 @@ import re
 import pytest
 import yaml
 
-from rosafe.declarations import literature
-from rosafe.declarations.reference import Reference
+from rosafe.declarations.literature import LITERATURE
 from tests.harness import ROOT
 
 PAPER = (ROOT / "paper" / "paper.md").read_text("utf-8")
@@ -40,9 +39,8 @@ def test_cited_keys_exist_and_are_used() -> None:
 
 
 def test_publications_of_representations_are_those_of_the_declarations() -> None:
-    declared = {one.key: one for one in vars(literature).values() if isinstance(one, Reference)}
-    shared = [key for key in re.findall(r"^@\w+\{([\w-]+),$", BIB, re.MULTILINE) if key in declared]
-    assert len(shared) >= 6 and all(declared[key].bibtex in BIB for key in shared)
+    shared = [key for key in re.findall(r"^@\w+\{([\w-]+),$", BIB, re.MULTILINE) if key in LITERATURE]
+    assert len(shared) >= 6 and all(LITERATURE[key].bibtex in BIB for key in shared)
 
 
 def test_only_names_and_a_statement_of_the_authors_are_placeholders() -> None:
