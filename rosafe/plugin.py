@@ -5,8 +5,7 @@ Import these names from here, and from no other module of rosafe::
     from rosafe.plugin import FramedStage, Parameter, Representation, frame_parameters
 
 Stability: within one `API_VERSION` these names, their arguments and their description in docs/own-representation.md do
-not change; new names may be added. If a name has to change, the old name remains available for one more release, and
-the log and ``rosafe doctor`` report each plugin that still uses it.
+not change; new names may be added.
 
 Attributes
 ----------

@@ -34,7 +34,6 @@ STARTING_FILES = (  # the same for single files
     "plugins/test_documents.py",
     "plugins/test_faults.py",
     "plugins/test_loading.py",
-    "plugins/test_old_names.py",
     "plugins/test_plugins.py",
     "test_harness.py",
 )

@@ -8,13 +8,11 @@ from __future__ import annotations
 import inspect
 import logging
 import math
-import re
 import sys
 import traceback
 import types
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -29,7 +27,6 @@ from .stage import FLOAT64, Output, Stage
 
 log = logging.getLogger("rosafe.plugin")
 Rows = tuple[int, ...]
-_PUBLIC = re.compile(r"^\s*(from|import)\s+rosafe\.plugin\b|^\s*from\s+rosafe\s+import\b.*\bplugin\b", re.MULTILINE)
 
 
 class PluginError(ValueError):
@@ -61,7 +58,7 @@ def checked(stage: type[Stage], file: str = "") -> type[Stage]:
         "PLUGIN": stage,
         "PLUGIN_FILE": path,
         "PLUGIN_LINE": _line_of(stage, path),
-        "CHECKS_NAN": _checks_nan(stage, path),
+        "CHECKS_NAN": not stage.REPRESENTATION.allow_nan,
         "SUPPORTS_IN_PLACE": False,
         "CHANNEL_INDEPENDENT": False,
     }
@@ -76,16 +73,6 @@ def _file_of(stage: type[Stage]) -> str:
     """Return the file of the first function that the class itself defines."""
     codes = (getattr(value, "__code__", None) for value in vars(stage).values())
     return next((code.co_filename for code in codes if code is not None), "unknown file")
-
-
-def _checks_nan(stage: type[Stage], file: str) -> bool:
-    """Return whether to reject NaN: not if it is declared, nor in plugins written for 0.2."""
-    if stage.REPRESENTATION.allow_nan:
-        return False
-    try:
-        return _PUBLIC.search(Path(file).read_text("utf-8", "replace")) is not None
-    except OSError:
-        return True
 
 
 def _line_of(stage: type[Stage], file: str) -> int:

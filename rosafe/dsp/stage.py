@@ -15,7 +15,6 @@ from rosafe.declarations.representation import Representation
 
 from . import buffer_pool, kernels
 from .numeric_limits import FloatArray
-from .old_names import OldNames
 from .signal_format import SignalFormat
 
 SAMPLE_RATE = Parameter(
@@ -25,7 +24,7 @@ FLOAT64 = np.dtype(np.float64)
 Output = FloatArray | tuple[FloatArray, ...]  # a tuple if the representation has several parts
 
 
-class Stage(OldNames):
+class Stage:
     """The computation of a processor: it converts blocks to blocks and keeps its state between them.
 
     A representation is a subclass with a declaration. It implements `build`, `process` and `reset`. If the defaults do

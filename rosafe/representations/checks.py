@@ -170,7 +170,7 @@ def _reserved_names(declared: Representation) -> Iterator[str]:
 
 
 def _conflicts(declared: Representation, other: Representation) -> Iterator[str]:
-    """Yield the names in use already. Those of files and commands are compared without regard to case."""
+    """Yield the names in use already. Names of files and commands are compared without regard to case."""
     for what, names in (("kind or word", _words), ("request or port", _commands), ("task", lambda one: (one.task,))):
         taken = {name.lower() for name in names(other)}
         for name in names(declared):

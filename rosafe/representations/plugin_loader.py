@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rosafe.declarations import plugins
-from rosafe.dsp import old_names
 from rosafe.dsp.plugin_checks import text_of_exception
 
 
@@ -28,7 +27,6 @@ class Loaded(NamedTuple):
 
     origin: str  # the path of the file, or the entry point
     found: Any
-    path: str  # of the file
 
 
 def described(problem: BaseException) -> str:
@@ -42,24 +40,20 @@ def load(problems: list[str], warnings: list[str]) -> Iterator[Loaded]:
     for origin, load_plugin in _candidates(problems, warnings):
         try:
             with _contained(origin):
-                found, path = load_plugin()
+                found = load_plugin()
         except BaseException as problem:  # including SystemExit and KeyboardInterrupt: the code is not ours
             problems.append(f"{origin}: {described(problem)}")
         else:
-            yield Loaded(origin, found, path)
+            yield Loaded(origin, found)
 
 
-def _candidates(problems: list[str], warnings: list[str]) -> Iterator[tuple[str, Callable[[], tuple[Any, str]]]]:
-    """Yield the origin of each plugin, and a function that imports it and returns it with its file."""
+def _candidates(problems: list[str], warnings: list[str]) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """Yield the origin of each plugin, and a function that imports it."""
     for folder in map(os.path.abspath, plugins.folders()):
         for path in _files(folder, problems, warnings):
             yield path, functools.partial(_import_file, path)
     for point in plugins.entry_points():
-        yield f"{point.name} ({point.value})", functools.partial(_load_entry_point, point)
-
-
-def _load_entry_point(point: importlib.metadata.EntryPoint) -> tuple[Any, str]:
-    return point.load(), str(getattr(sys.modules.get(point.module), "__file__", ""))
+        yield f"{point.name} ({point.value})", point.load
 
 
 def _files(folder: str, problems: list[str], warnings: list[str]) -> list[str]:
@@ -100,7 +94,7 @@ def _writable_by_others(path: str) -> str:
     return f"{path}: can be changed by {writer}, and plugins run with your rights; chmod go-w {path}"
 
 
-def _import_file(path: str) -> tuple[ModuleType, str]:
+def _import_file(path: str) -> ModuleType:
     name = f"rosafe_plugin_{Path(path).stem}"
     number = 2
     while name in sys.modules:  # a file with the same name in another folder
@@ -115,7 +109,7 @@ def _import_file(path: str) -> tuple[ModuleType, str]:
     except BaseException:
         del sys.modules[name]
         raise
-    return module, path
+    return module
 
 
 @contextlib.contextmanager
@@ -143,11 +137,3 @@ def _contained(origin: str) -> Iterator[None]:
             os.environ.clear()
             os.environ.update(environment)
         sys.path[:] = path
-
-
-def old_names_used(path: str) -> list[str]:
-    """Return the names of version 0.2 in the source at `path`."""
-    try:
-        return old_names.used(Path(path).read_bytes())
-    except (OSError, SyntaxError, ValueError):
-        return []

@@ -66,12 +66,8 @@ class _Search:
         self.problems: list[str] = []
         self.warnings: list[str] = []
         offered: list[tuple[str, type[Stage]]] = []
-        for origin, found, path in plugin_loader.load(self.problems, self.warnings):
-            names = plugin_loader.old_names_used(path)
-            stages = [stage for stage in _stages_in(found) if self._declared(origin, stage)]
-            if stages and names:
-                self.warnings.append(f"{origin}: uses old names, which the next release removes: {', '.join(names)}")
-            offered += [(origin, stage) for stage in stages]
+        for origin, found in plugin_loader.load(self.problems, self.warnings):
+            offered += [(origin, stage) for stage in _stages_in(found) if self._declared(origin, stage)]
         self._accept(offered)
         self.stages = _ordered(self.stages)
 

@@ -56,7 +56,7 @@ def test_methods_are_those_of_the_library_page() -> None:
 
 
 def test_versions() -> None:
-    """The names of 0.2 still exist: their removal requires a release with a warning."""
+    """The names of 0.2 that remain."""
     first = {name: release(version) for name, (_, version) in listed().items()}
     assert max(first.values()) <= release(VERSION)
     of_0_2 = {"process", "Stream", "load", "plot", "to_xarray", "__version__"}

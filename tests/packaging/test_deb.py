@@ -176,6 +176,6 @@ def test_nodes_run_from_the_packages(root: Path, private_graph: tuple[Graph, Mas
 
 def test_two_builds_are_equal(packages: dict[str, Path], tmp_path: Path) -> None:
     """The help of `rosafe process`, and so its manual page, would list the parameters of plugins."""
-    plugins = str(ROOT / "tests" / "plugins" / "plugins_0_2")
+    plugins = str(ROOT / "tests" / "plugins" / "plugins_with_hooks")
     for name, path in build(tmp_path, TZ="Asia/Tokyo", LC_ALL="C", ROSAFE_PLUGINS=plugins).items():
         assert filecmp.cmp(path, packages[name], shallow=False), name

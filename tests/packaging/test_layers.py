@@ -14,7 +14,6 @@ PACKAGE = ROOT / "rosafe"
 _NUMERICS = {"declarations", "dsp", "representations"}
 ALLOWED_IMPORTS: dict[str, set[str]] = {
     "declarations": set(),
-    "vocabulary": {"declarations"},
     "sound": set(),
     "dsp": {"declarations"},
     "plugin": {"declarations", "dsp"},

@@ -20,9 +20,9 @@ from tests.plugins.support import python
 from tests.plugins.test_documents import plugins
 
 OF_THE_PAGE = ("zeroCrossings", "bands", "slowRatemap")
-OF_0_2 = ("everyNth", "meanSquare", "fineIld")
+WITH_HOOKS = ("everyNth", "meanSquare", "fineIld")
 SHORT = {"factors": PLAIN, "samples": SAMPLES, "means": FRAMED}
-KINDS = (*OF_THE_PAGE, *OF_0_2, *SHORT)
+KINDS = (*OF_THE_PAGE, *WITH_HOOKS, *SHORT)
 NAMES = {kind: f"{'nth' if kind == 'everyNth' else kind}_0" for kind in KINDS}  # of the processors that are requested
 
 
@@ -33,8 +33,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path.mkdir()
     for name in ("zerocrossings.py", "bands.py", "slowratemap.py"):
         (path / name).write_text(plugins()[name])
-    old = Path(__file__).with_name("plugins_0_2") / "oldnames.py"
-    (path / old.name).write_text(old.read_text())
+    hooks = Path(__file__).with_name("plugins_with_hooks") / "hooks.py"
+    (path / hooks.name).write_text(hooks.read_text())
     for kind, text in SHORT.items():
         plugin = text_of(Fault(text, "", "")).replace('kind="mine"', f'kind="{kind}"')
         plugin = plugin.replace("my_", f"{kind}_").replace('"my"', f'"{kind}"')

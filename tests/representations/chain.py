@@ -166,8 +166,8 @@ class Chain:
             stage = self.stages[kind]
             known = {**stage.parameters, **stage.derived}
             found.update((name, known[name]) for name in KINDS[kind].coordinates)
-            if stage.output.framed:
-                found[f"{kind}_frameRate"] = stage.output.rate
+            if stage.output_format.framed:
+                found[f"{kind}_frameRate"] = stage.output_format.rate
         return found
 
 

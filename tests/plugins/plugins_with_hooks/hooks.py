@@ -1,13 +1,10 @@
-"""All the names of 0.2 that an author could use: a stage with a hook each, and a child that needs its by-product."""
+"""Every hook that an author may define: a stage that changes rate, a child that needs its extra, a variant."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.representation import Derived, Part, Representation
-from rosafe.dsp.framing import FramedStage, frame_parameters
-from rosafe.dsp.stage import Stage
+from rosafe.plugin import Derived, FramedStage, Parameter, Part, Representation, Stage, frame_parameters
 from rosafe.representations.ild import Ild
 
 
@@ -23,38 +20,39 @@ class Every(Stage):
         derived=(Derived("ev_gain", "double", "Gain"),),
         word="nth",
     )
-    PROVIDES = ("square",)
+    EXTRAS = ("square",)
 
     def process(self, block, extra=None):
         room = self._output_array(block[..., ::1].shape)
         room[...] = block
         samples = np.concatenate((self._rest, self._as_valid_block(room)), axis=-1) if self._rest is not None else room
-        step = self._values["ev_step"]
+        step = self.values["ev_step"]
         count = samples.shape[-1] // step
         self._rest = samples[..., count * step :].copy()
         output = np.ascontiguousarray(samples[..., : count * step : step]) * self._gain
         self.provided = {"square": output**2} if "square" in self.provide else {}
         return output
 
-    def complete(self, count):
-        return count // self._values["ev_step"]
+    def output_count(self, count):
+        return count // self.values["ev_step"]
 
     @property
     def derived(self):
         return {"ev_gain": self._gain}
 
-    def _build(self, values, changed):
-        super()._build(values, changed)
-        self._gain = 2.0 * self.given.rate / self.given.sample_rate
+    def build(self, values, changed):
+        super().build(values, changed)
+        self._gain = 2.0 * self.input_format.rate / self.input_format.sample_rate
         self._rest = None
 
-    def _received(self, before):
-        super()._received(before)
-        self._build(self._values, frozenset())
+    def input_format_changed(self, before):
+        super().input_format_changed(before)
+        self.build(self.values, frozenset())
 
-    def _output(self):
-        step = self._values["ev_step"]
-        return replace(super()._output(), rate=self.given.rate / step, framed=True, hop=step, window=1)
+    @property
+    def output_format(self):
+        step = self.values["ev_step"]
+        return replace(super().output_format, rate=self.input_format.rate / step, framed=True, hop=step, window=1)
 
     def reset(self):
         self._rest = None
@@ -70,15 +68,15 @@ class Needing(FramedStage):
         parts=(Part("mean", ("channel", "time")), Part("square", ("channel", "time"))),
         parameters=(*frame_parameters("ms"),),
     )
-    PREFIX = "ms"
+    prefix = "ms"
 
     @property
-    def needs(self):
+    def required_extra(self):
         return "square"
 
-    def __init__(self, given, **parameters):
+    def __init__(self, input_format, **parameters):
         self._held = None
-        super().__init__(given, **parameters)
+        super().__init__(input_format, **parameters)
 
     def process(self, block, extra=None):
         both = np.concatenate((block, extra), axis=1)
@@ -95,11 +93,12 @@ class Needing(FramedStage):
     def part_rows(self, rows):
         return (self.output_rows(rows),) * 2
 
-    def complete(self, count):
-        return super().complete(count)
+    def output_count(self, count):
+        return super().output_count(count)
 
-    def _output(self):
-        return super()._output()
+    @property
+    def output_format(self):
+        return super().output_format
 
 
 class FineIld(Ild):
@@ -108,4 +107,4 @@ class FineIld(Ild):
     REPRESENTATION = Representation(
         kind="fineIld", doc="ILD", parent="ihc", axes=("channel", "time"), parameters=frame_parameters("fi")
     )
-    PREFIX = "fi"
+    prefix = "fi"
