@@ -442,6 +442,13 @@ MUTATIONS = (
     ),
     # --- http_server
     _http(
+        "connection-of-another-address-closed",
+        "connections.py",
+        "_silent_longest([account] if full else self._accounts.values())",
+        "_silent_longest(self._accounts.values())",
+        "tests/http_server/test_connections.py",
+    ),
+    _http(
         "http-long-polls-unlimited",
         "connections.py",
         "        if len(polls) >= limit:\n",
@@ -511,6 +518,27 @@ MUTATIONS = (
         "tests/live/test_plots.py",
     ),
     # --- localization
+    _localization(
+        "replaced-frames-not-subtracted",
+        "evidence.py",
+        "if few and len(replaced):",
+        "if False:",
+        "tests/localization/test_evidence.py",
+    ),
+    _localization(
+        "rotation-of-another-frame",
+        "evidence.py",
+        "np.repeat(yaw, evidence.shape[1])",
+        "np.tile(yaw, evidence.shape[1])",
+        "tests/localization/test_evidence.py",
+    ),
+    _localization(
+        "source-of-no-length",
+        "scene_file.py",
+        "if end <= start:",
+        "if end < start:",
+        "tests/localization/test_scene.py",
+    ),
     _localization(
         "model-learned-again-for-integer-rate",
         "model_cache.py",
@@ -843,6 +871,20 @@ MUTATIONS = (
         "tests/validation/test_validate.py",
     ),
     # --- localizer node
+    _localizer_node(
+        "messages-of-an-earlier-stream",
+        "frame_source.py",
+        "if index < self._newest:",
+        "if False:",
+        "tests/localizer_node/test_frame_source.py",
+    ),
+    _localizer_node(
+        "successor-loses-its-processors",
+        "tree_link.py",
+        "if self._created.names and not registration.registrar().is_replaced:",
+        "if self._created.names:",
+        "tests/localizer_node/test_tree_link.py",
+    ),
     _localizer_node(
         "localizer-sources-stay",
         "localization_loop.py",

@@ -8,6 +8,8 @@ import socket
 from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from typing import Any
+from unittest import mock
 
 from aiohttp import web
 
@@ -154,6 +156,25 @@ def test_authenticated_connections_are_closed_last() -> None:
         assert await authenticated.get("/now") == 200
 
     run(check)
+
+
+def test_a_full_address_loses_its_own_connections() -> None:
+    """Also if another address has a connection that is not authenticated. All addresses of this machine are one."""
+    connections = Connections(LIMITS, _format, logging.getLogger())
+    dropped: list[str] = []
+
+    def connection(address: str) -> Any:
+        one = mock.Mock(has_unread_data=False, drop=lambda: dropped.append(address))
+        one.account = connections.admit(one, address)
+        return one
+
+    connection("10.0.0.2")
+    for _ in range(8):
+        one = connection("10.0.0.1")
+        one.account.idle[one] = one.account.silent.pop(one)  # authenticated
+    assert not dropped
+    connection("10.0.0.1")
+    assert dropped == ["10.0.0.1"]
 
 
 def test_a_burst_of_requests_does_not_lock_out_other_clients() -> None:

@@ -121,6 +121,7 @@ def test_truth_is_relative_to_the_head(tmp_path: Path) -> None:
         ("sources: [{signal: noise, azimuth: [[1, 0], [0, 0]]}]", "ascending"),
         ("sources: [{signal: noise, azimuth: [[1, 0, 2]]}]", "[time in s, degrees]"),
         ("sources: [{signal: noise, start: 3, end: 2}]", "end: expected more than start"),
+        ("sources: [{signal: noise, start: 3, end: 3}]", "end: expected more than start"),
         ("sources: [{signal: noise, name: 'a,b'}]", "name: expected"),
         ("sources: [{signal: noise, name: a}, {signal: noise, name: a}]", "occurs twice"),
         ("sources: [" + "{signal: noise}," * 40 + "]", "1 to 32 sources"),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import asyncio
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import pytest
 
@@ -48,3 +50,32 @@ def test_a_node_that_the_master_does_not_know(monkeypatch: pytest.MonkeyPatch) -
         assert status.state() == (WARN, "waiting for rosAFE: /rosAFE is not registered at the master")
     finally:
         link.close()
+
+
+@pytest.mark.parametrize("replaced", [False, True], ids=["alone", "replaced"])
+def test_a_node_that_was_replaced_leaves_its_processors_to_its_successor(
+    monkeypatch: pytest.MonkeyPatch, replaced: bool
+) -> None:
+    removed: list[list[str]] = []
+
+    class Client:
+        @classmethod
+        async def load(cls, *_: Any) -> Client:
+            return cls()
+
+        async def close(self) -> None:
+            pass
+
+    class Created:
+        names: ClassVar[list[str]] = ["ild"]
+
+        async def remove(self, graph: Any, client: Any) -> None:
+            removed.append(self.names)
+
+    monkeypatch.setattr(tree_link, "CreatedProcessors", Created)
+    monkeypatch.setattr(tree_link, "ComponentClient", Client)
+    monkeypatch.setattr(tree_link.registration, "registrar", lambda: SimpleNamespace(is_replaced=replaced))
+    unused: Any = None
+    link = tree_link.TreeLink("/rosAFE", "", unused, unused, NodeStatus(lambda: None))
+    asyncio.run(link._remove_created(unused))
+    assert removed == ([] if replaced else [["ild"]])

@@ -1,0 +1,67 @@
+"""The sums of a sliding window are those of its frames alone, for any blocks and any rotation of the head."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rosafe.localization import angles
+from rosafe.localization.cues import CLASSES, ILD_BINS, ITD_BINS, LEVEL_CLASSES, Cues, floors
+from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.evidence import EvidenceWindow, rotate
+
+CHANNELS, LENGTH, FRAMES = 3, 40, 170
+RANDOM = np.random.default_rng(5)
+YAW = {
+    "still": np.zeros(FRAMES),
+    "turned": np.full(FRAMES, 47.0),
+    "turning": np.linspace(-100, 200, FRAMES),
+    "then turning": np.r_[np.zeros(90), np.linspace(0, 60, FRAMES - 90)],
+}
+
+
+@pytest.fixture(scope="module")
+def model() -> DirectionModel:
+    """Return a model whose tables are random."""
+    rows = CHANNELS * CLASSES
+    description = {
+        "sample_rate": 16000,
+        "parameters": {"fb_nChannels": CHANNELS},
+        "head": "random",
+        "is_sphere": False,
+        "level_gain_db": 0.0,
+    }
+    tables = [RANDOM.standard_normal((rows * bins + 1, len(angles.grid()))) for bins in (ITD_BINS, ILD_BINS)]
+    for table in tables:
+        table[-1] = 0.0  # of frames without cues
+    return DirectionModel(description, *tables)
+
+
+def random_cues() -> Cues:
+    first = np.arange(CHANNELS) * CLASSES
+    coherence = LEVEL_CLASSES * RANDOM.integers(0, CLASSES // LEVEL_CLASSES, (FRAMES, CHANNELS))
+    rows = ((first + coherence) * bins + RANDOM.integers(0, bins, (FRAMES, CHANNELS)) for bins in (ITD_BINS, ILD_BINS))
+    level = RANDOM.uniform(-60, -20, (FRAMES, CHANNELS))
+    level[60::25] = -90.0  # the floor changes, and changes again when these frames leave the window
+    return Cues(next(rows), next(rows), level, RANDOM.random((FRAMES, CHANNELS)) < 0.8)
+
+
+def direct_sum(model: DirectionModel, cues: Cues, yaw: np.ndarray) -> np.ndarray:
+    """Return the sums (C, A) of the frames, each turned alone."""
+    terms = model.terms(*model.rows(cues, floors(cues.level))).astype(np.float64)
+    turned = [rotate(frame, np.full(CHANNELS, turn)) for frame, turn in zip(terms, yaw, strict=True)]
+    return np.asarray(np.sum(turned, axis=0))
+
+
+@pytest.mark.parametrize("yaw", YAW.values(), ids=YAW)
+@pytest.mark.parametrize("block", [1, 7, 30, 100])
+def test_sums_are_those_of_the_frames_in_the_window(model: DirectionModel, block: int, yaw: np.ndarray) -> None:
+    cues, window = random_cues(), EvidenceWindow(model, LENGTH)
+    for begin in range(0, FRAMES, block):
+        part = slice(begin, begin + block)
+        window.extend(cues.select(part), np.ones(len(yaw[part])), yaw[part])
+        end = min(begin + block, FRAMES)
+        kept = slice(max(0, end - LENGTH), end)
+        expected = direct_sum(model, cues.select(kept), yaw[kept])
+        np.testing.assert_allclose(window.sums(), expected, atol=1e-4)  # single precision is turned
+    assert np.abs(expected).max() > 10
