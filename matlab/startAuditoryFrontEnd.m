@@ -1,3 +1,5 @@
-function startAuditoryFrontEnd()
-%STARTAUDITORYFRONTEND  Does nothing. It is called if the MATLAB Auditory Front-End of Two!Ears is not on the path.
+function startAuditoryFrontEnd(varargin)
+%STARTAUDITORYFRONTEND  Call the function of this name of Two!Ears if it is on the path; otherwise do nothing.
+
+rosafe.callOther(mfilename(), fileparts(mfilename('fullpath')), varargin{:});
 end

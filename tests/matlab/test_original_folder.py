@@ -17,6 +17,7 @@ FUNCTIONS = {
     "initRosAFE": """
         function [bass, rosAFE, client] = initRosAFE(openRobotsMatlabPath, twoEarsPath, rosAFEPath)
         addpath(genpath(fullfile(pwd, 'AuditoryFrontEnd')));
+        startTwoEars;
         startAuditoryFrontEnd;
         startRosAFE;
         client = genomix.client;
@@ -92,3 +93,42 @@ def test_a_client_script_in_the_original_folder(world: World, tmp_path: Path, fr
     assert shown["columns"] == [31, 3]
     assert shown["class"] == ("rosafe.FeatureSignal" if front_end else "FeatureSignal")
     assert shown["left"] == 0
+
+
+# Functions of Two!Ears, which add folders to the path: without Two!Ears nothing happens; with it, before or behind our
+# folder, its own functions are called.
+STARTS = """
+    ours = path();
+    startTwoEars; startTwoEars(); startTwoEars('Config.xml'); startTwoEars('info'); startAuditoryFrontEnd;
+    show('unchanged', strcmp(ours, path()));
+    addpath(fullfile(pwd, 'TwoEars'));
+    startTwoEars;
+    startRosAFE;
+    startTwoEars('Config.xml'); startAuditoryFrontEnd('all');
+    show('first', strsplit(path(), pathsep()){2});
+    show('wrong', message(@() startTwoEars('missing.xml')));
+    show('still', strcmp(fileparts(which('startTwoEars')), fileparts(which('startRosAFE'))));
+    cd(fileparts(which('startRosAFE'))); startTwoEars;
+"""
+
+
+@pytest.mark.exploration
+def test_functions_that_start_two_ears(world: World, tmp_path: Path) -> None:
+    folder = tmp_path / "TwoEars"
+    folder.mkdir()
+    for name in ("startTwoEars", "startAuditoryFrontEnd"):
+        text = (
+            f"function {name}(varargin)\nif isequal(varargin, {{'missing.xml'}}), error('two:ears', 'no file'); end\n"
+            f"show('{name}_', varargin);\nend\n"
+        )
+        (folder / f"{name}.m").write_text(text, "utf-8")
+    output = octave.run(world, STARTS, folder=tmp_path)
+    assert [line for line in output.splitlines() if "_=" in line] == [
+        "startTwoEars_=[]",
+        'startTwoEars_=["Config.xml"]',
+        'startAuditoryFrontEnd_=["all"]',
+    ]
+    shown = octave.values(output)
+    assert shown["unchanged"] and shown["still"]
+    assert shown["first"].endswith("matlab")
+    assert shown["wrong"] == "two:ears no file"
