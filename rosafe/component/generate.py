@@ -295,6 +295,7 @@ def environment() -> dict[str, str]:
         if prefix == paths.SYSTEM_PREFIX:
             programs, python, tcl = [], [], []
     else:
+        python.append(paths.CODE_DIR / "python")
         programs, tcl, matlab = [paths.CODE_DIR / "scripts"], [paths.CODE_DIR / "tcl"], paths.CODE_DIR / "matlab"
     if generation is not None:
         if _is_current(generation.parent, generation.name):  # the name that stays when the sources change
