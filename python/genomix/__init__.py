@@ -19,10 +19,11 @@ import time
 
 from genomix import event
 from genomix.client import Client
+from genomix.component import Component
 from genomix.event import GenoMError
 from genomix.request import Request, Status
 
-__all__ = ["Client", "GenoMError", "Request", "Status", "connect", "event", "update"]
+__all__ = ["Client", "Component", "GenoMError", "Request", "Status", "connect", "event", "update"]
 
 
 def connect(address: str = "") -> Client:

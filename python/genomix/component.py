@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import inspect
 import json
@@ -16,7 +17,7 @@ from genomix.request import Request, Status, warn
 if TYPE_CHECKING:
     from genomix.client import Client
 
-_OPTIONS = ("ack", "callback", "oneway")  # keywords that are no parameters
+_OPTIONS = ("ack", "callback", "oneway")  # keywords beside the parameters
 
 
 class Component:
@@ -24,9 +25,9 @@ class Component:
 
     A service is called with nothing, with one dictionary of parameters, with values in order, with keywords, or with
     values and keywords. Missing parameters have their defaults. The call waits for the end and returns the outputs as
-    a dictionary; that of an activity, such as a processor, which ends when it is stopped, returns with ``ack=True`` as
-    soon as the activity runs, with ``callback=function`` at once (the function is called with the request at its end),
-    and with ``oneway=True`` at once, without a request. Ctrl-C during a call aborts the activity.
+    a dictionary. An activity such as a processor ends when it is stopped: with ``ack=True`` the call returns a request
+    as soon as the activity runs, with ``callback=function`` at once (the function is called with the request at its
+    end), and with ``oneway=True`` it returns None at once. Ctrl-C during a call aborts the activity.
 
     A port is called with the name of an element (``rosAFE.ildPort("ild")``) and returns the newest message.
 
@@ -81,18 +82,18 @@ def _service(client: Client, about: dict[str, Any], name: str, service: dict[str
         if options.get("oneway"):
             client.send(f"/send/{place}", oneway="1", **query)
             return None
-        background = options.get("ack") or options.get("callback")
-        if not background and not service["activity"]:
+        ack, callback = options.get("ack"), options.get("callback")
+        if not ack and not callback and not service["activity"]:
             return _outputs(full_name, client.get(f"/call/{place}", **query, **form))
-        ack = {} if options.get("callback") else {"ack": "1"}
-        request = Request(client, full_name, client.send(f"/send/{place}", **query, **ack), form)
-        if background:
-            if options.get("callback"):
-                request.notify(options["callback"])
-            elif request.status is Status.error:
-                return request.result  # raises its error
-            return request
-        return _end(request)
+        flags = {"ack": "1"} if ack else {}  # without it, the id of the request is known at once, for Ctrl-C
+        request = Request(client, full_name, client.send(f"/send/{place}", **query, **flags), form)
+        if not ack and not callback:
+            return _end(request)
+        if ack and request.status is Status.error:
+            return request.result  # raises its error
+        if callback:
+            request.notify(callback)
+        return request
 
     _document(method, about, name, _service_help(full_name, service))
     method.__signature__ = _signature(service["parameters"])  # type: ignore[attr-defined]
@@ -104,7 +105,8 @@ def _end(request: Request) -> dict[str, Any]:
     try:
         request.wait()
     except BaseException:
-        request.abort()
+        with contextlib.suppress(GenoMError):
+            request.abort()
         raise
     return request.result or {}
 

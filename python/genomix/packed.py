@@ -14,7 +14,7 @@ from genomix.event import GenoMError, error_of
 
 
 def decode(data: bytes) -> Any:
-    """Return the value of an answer. Raises GenoMError: that of the answer, or ``::genom::mwerr`` if it is damaged."""
+    """Return the value of an answer. Raises the GenoMError that it contains, or ``::genom::mwerr``."""
     try:
         reader = _Reader(data)
         failed = data[:1] == b"!"
@@ -28,7 +28,7 @@ def decode(data: bytes) -> Any:
 
 
 class _Reader:
-    """Reads values one after the other."""
+    """Reads values in their order."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data

@@ -12,6 +12,7 @@ import io
 import json
 import os
 import struct
+import weakref
 from collections.abc import Mapping
 from typing import Any
 
@@ -279,6 +280,8 @@ class TopicReader:
         self._class = message_class
         self._slots = asyncio.Semaphore(MAX_CONNECTIONS)
         self._reads: dict[str, asyncio.Task[Any]] = {}  # that have not started yet
+        # A node of rospy closes a connection when another one with the same caller id and topic is opened.
+        self._locks: weakref.WeakValueDictionary[str, asyncio.Lock] = weakref.WeakValueDictionary()
 
     async def read(self, topic: str) -> Any:
         """Return the message, None if the topic has none yet; NotRegisteredError if the component has no such topic.
@@ -290,7 +293,7 @@ class TopicReader:
         return await asyncio.shield(self._reads[topic])
 
     async def _read(self, topic: str) -> Any:
-        async with self._slots:
+        async with self._locks.setdefault(topic, asyncio.Lock()), self._slots:
             del self._reads[topic]
             # Check at the node first: a connection for a topic that it does not have makes it log kilobytes.
             address = await self._graph.topic_address(topic, self._instance)

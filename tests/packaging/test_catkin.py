@@ -149,6 +149,11 @@ def test_tcl_package(workspace: Path) -> None:
     assert str(workspace / "install" / "lib" / "tcltk" / "genomix") in shown
 
 
+def test_python_client(workspace: Path) -> None:
+    shown = printed(sourced(workspace, f"{PYTHON} -c 'import genomix; print(genomix.__file__)'"))
+    assert shown.startswith(f"{workspace}/install/lib/python3/dist-packages/genomix/")
+
+
 def test_environment_for_children(workspace: Path) -> None:
     install = workspace / "install"
     python = install / "lib" / "python3" / "dist-packages"

@@ -61,7 +61,7 @@ def test_sets_the_paths(copy: Path, shell: str) -> None:
     found = variables(sourced(shell, f"{source(copy)}; {SHOW}"))
     generated = copy / ".generated" / "current"
     assert found["PATH"] == f"{copy}/scripts:{environment()['PATH']}"
-    assert found["PYTHONPATH"].split(":")[:2] == [f"{generated}/python", str(copy)]
+    assert found["PYTHONPATH"].split(":")[:3] == [f"{generated}/python", str(copy), f"{copy}/python"]
     assert found["ROS_PACKAGE_PATH"] == f"{generated}/share"
     assert found["TCLLIBPATH"] == f"{{{copy}/tcl}}"  # a Tcl list, and the path has a blank
     assert found["OCTAVE_PATH"] == found["MATLABPATH"] == f"{copy}/matlab"

@@ -106,6 +106,7 @@ MAX_MARKED_PERCENT: dict[str, float] = {
     "examples": 0.0,
     "matlab": 2.0,
     "paper": 0.0,
+    "python": 0.0,
     "rosafe": 0.8,
     "rosafe/bass": 0.9,
     "rosafe/client": 2.9,
