@@ -8,7 +8,6 @@ import json
 import os
 import re
 import secrets
-import select
 import socket
 import threading
 import weakref
@@ -80,7 +79,9 @@ class Client:
             The component, its name in this session, or the path of its plugin.
         """
         name = component if isinstance(component, str) else label(component)
-        self.get("/unload/" + quote(name.rsplit("/", 1)[-1].removesuffix(".so"), safe="", errors="replace"))
+        if name.endswith(".so"):
+            name = name.rsplit("/", 1)[-1].removesuffix(".so")
+        self.get("/unload/" + quote(name, safe="", errors="replace"))
 
     def get(self, path: str, **query: str) -> Any:
         """Return the value of a URL of docs/genomixd.md; a GenoMError of the server is raised."""
@@ -148,17 +149,29 @@ class _Link:
                 self._owner, self._idle = os.getpid(), []
             while self._idle:
                 connection = self._idle.pop()
-                if not select.select([connection.sock], [], [], 0)[0]:
+                if _is_open(connection.sock):
                     return connection
                 connection.close()  # genomixd has closed it
         connection = http.client.HTTPConnection(self.host, self.port, timeout=CONNECT_SECONDS)
         try:
             connection.connect()
             connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        except OSError as problem:
+        except (OSError, UnicodeError) as problem:
             what = f"expected genomixd at {self.address}, got no connection ({problem}); start it: genomixd &"
             raise GenoMError("::genom::mwerr", what=what) from None
         return connection
+
+
+def _is_open(sock: socket.socket) -> bool:
+    """Return whether the server has neither closed an idle connection nor sent unexpected data."""
+    sock.setblocking(False)
+    try:
+        sock.recv(1, socket.MSG_PEEK)
+    except BlockingIOError:
+        return True
+    except OSError:
+        pass
+    return False
 
 
 def _value(response: http.client.HTTPResponse, body: bytes) -> Any:

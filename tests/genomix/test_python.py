@@ -107,13 +107,20 @@ def test_a_public_script_runs_without_ros(world: World) -> None:
     assert done.stderr == ""
 
 
-def test_the_session_of_the_document(world: World) -> None:
-    text = (harness.ROOT / "docs" / "genomix-python.md").read_text("utf-8")
-    (block,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+@pytest.mark.parametrize(
+    ("document", "shown", "printed"),
+    [
+        ("docs/genomix-python.md", "len(centres), len(levels), {len(row) for row in levels}", "16 16 {100}"),
+        ("README.md", "ild['numberOfChannels'], ild['sampleRate']", "16 100"),
+    ],
+)
+def test_the_session_of_a_document(world: World, document: str, shown: str, printed: str) -> None:
+    text = (harness.ROOT / document).read_text("utf-8")
+    (block,) = (b for b in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "import genomix" in b)
     path = world.graph.home / "document.py"
-    path.write_text(block + "\nprint(len(centres), len(levels), {len(row) for row in levels})\n")
+    path.write_text(f"{block}\nprint({shown})\n")
     done = world.graph.run(harness.PYTHON, str(path), check=True, GENOMIXD=f"127.0.0.1:{world.port}")
-    assert done.stdout == "16 16 {100}\n"
+    assert (done.stdout, done.stderr) == (f"{printed}\n", "")
 
 
 def test_all_forms_of_a_call(g: genomix.Client) -> None:
@@ -165,7 +172,7 @@ def test_errors(g: genomix.Client, world: World) -> None:
     with error("::rosAFE::e_noSuchProcessor", "there is no processor 'x'") as caught:
         afe.removeProcessor("x")
     assert (caught.value.ex, caught.value.detail) == ("::rosAFE::e_noSuchProcessor", {})
-    assert isinstance(caught.value, RuntimeError)
+    assert issubclass(event.GenoMError, RuntimeError)
     copies: list[Any] = [copy.deepcopy(caught.value), pickle.loads(pickle.dumps(caught.value))]
     for same in copies:
         assert (same.ex, same.what, str(same)) == (caught.value.ex, caught.value.what, str(caught.value))
@@ -201,6 +208,8 @@ def test_addresses() -> None:
     for address in ("a b", "host:x", "host:70000", "http://host/path", "host:0"):
         with error("::genom::mwerr", "expected host or host:port"):
             genomix.connect(address)
+    with error("::genom::mwerr", "got no connection"):
+        genomix.connect("\u00fc" * 100)
     port = harness.free_port()
     with error("::genom::mwerr", f"expected genomixd at [::1]:{port}, got no connection"):
         genomix.connect(f"[::1]:{port}")
@@ -296,6 +305,7 @@ def test_instances(world: World, g: genomix.Client) -> None:
         with error("::rosAFE::e_noSuchProcessor"):
             g.load("rosAFE").getDependencies("onlyLeft")
         g.unload(right)
+        g.unload("/opt/lib/genom/ros/plugins/left.so")
         with error("::genom"):
             g.unload("nobody")
 
