@@ -5,6 +5,7 @@ AES69-2022, "AES standard for file exchange - Spatial acoustic data file format"
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import os
 from pathlib import Path
@@ -14,13 +15,14 @@ import numpy as np
 
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.offline.containers import open_hdf5
 from rosafe.terminal import printable
 
 CONVENTION = "SimpleFreeFieldHRIR"
-MAX_FILE_BYTES = 1 << 30
 MAX_RESPONSES = 100_000
 MAX_LENGTH = 16384  # samples of an impulse response
 MAX_DIRECTIONS = 720  # in the horizontal plane
+MAX_NUMBERS = 1 << 23  # in the responses of the horizontal plane
 MIN_PEAK, MAX_PEAK = 1e-6, 1e6  # of a response
 MIN_RATE, MAX_RATE = 8000.0, 768_000.0  # Hz
 MAX_ELEVATION = 1.0  # degrees; positions up to here belong to the horizontal plane
@@ -55,30 +57,19 @@ def read_sofa(path: str | os.PathLike[str]) -> HorizontalResponses:
         The file is missing, unreadable, no SOFA file or unsuitable. One line that names the file.
     """
     name = printable(os.fspath(path))
+    if not importlib.util.find_spec("h5py"):  # the child process imports it
+        raise ValueError(f"{name}: reading SOFA files needs h5py; install it with scripts/install")
     try:
-        import h5py
-    except ImportError:
-        raise ValueError(f"{name}: reading SOFA files needs h5py; install it with scripts/install") from None
-    file = Path(path).expanduser()
-    try:
-        if not file.is_file():
-            raise ValueError(f"{name}: expected a SOFA file, got {_kind_of(file)}")
-        if file.stat().st_size > MAX_FILE_BYTES:
-            raise ValueError(f"{name}: expected a file of at most {MAX_FILE_BYTES >> 20} MiB")
-        with h5py.File(file, "r") as content:
+        with open_hdf5(Path(path).expanduser()) as content:
             return _SofaReader(name, content).horizontal()
+    except FileNotFoundError:
+        raise ValueError(f"{name}: expected a SOFA file, got a missing file") from None
     except ValueError as problem:
         if str(problem).startswith(f"{name}: "):
             raise
-        raise ValueError(f"{name}: damaged SOFA file: {_first_line(problem)}") from None
-    except (OSError, RuntimeError, KeyError, TypeError) as problem:
-        raise ValueError(
-            f"{name}: expected a SOFA file (HDF5), got another or a damaged file ({_first_line(problem)})"
-        ) from None
-
-
-def _kind_of(file: Path) -> str:
-    return "a folder" if file.is_dir() else "a missing file" if not file.exists() else "a special file"
+        raise ValueError(f"{name}: expected a SOFA file, got another or a damaged one: {_first_line(problem)}") from None
+    except OSError as problem:
+        raise ValueError(f"{name}: {problem.strerror or _first_line(problem)}") from None
 
 
 def _first_line(problem: BaseException) -> str:
@@ -139,6 +130,8 @@ class _SofaReader:
         rate = float(self._array("Data.SamplingRate", 1)[0])
         self._expect(MIN_RATE <= rate <= MAX_RATE, f"a sample rate from {MIN_RATE:g} to {MAX_RATE:g} Hz", f"{rate:g}")
         rows, azimuths = self._horizontal_rows(shape[0])
+        numbers = 2 * len(rows) * shape[2]
+        self._expect(numbers <= MAX_NUMBERS, f"responses of at most {MAX_NUMBERS} numbers", numbers)
         ears = self._ears()
         responses = self._rows(data, rows)[:, ears]
         self._expect(bool(np.isfinite(responses).all()), "finite numbers in Data.IR", "NaN or infinity")

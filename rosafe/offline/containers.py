@@ -14,11 +14,14 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rosafe.input import open_descriptor
 from rosafe.offline.isolated import MAX_TEXT, blocks
 from rosafe.offline.memory import LESS, refuse_over_available
 from rosafe.offline.result_metadata import is_scalar, new_array, parse_metadata, restored
@@ -43,24 +46,121 @@ def read_container(kind: str, path: Path, which: str) -> tuple[dict[str, Any], A
     ValueError
         The file is damaged or not allowed, or the child process has sent nothing for `STALL` seconds.
     OSError
-        The child process cannot be started.
+        The file cannot be opened, or the child process cannot be started.
     """
-    modules = [os.path.abspath(folder) for folder in sys.path if folder]
-    request = {"path": os.path.abspath(path), "kind": kind, "arrays": which, "modules": modules}
-    command = [_python(), "-I", "-S", "-W", "ignore", _PROGRAM, json.dumps(request)]
-    alone = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"}  # no plugins of HDF5
-    with subprocess.Popen(
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        cwd="/",
-        env={**os.environ, **alone},
-    ) as child:
+    with _reading(kind, path, which) as (pipe, head):
+        arrays = head["arrays"]
+        refuse_over_available(sum(math.prod(one["shape"], start=8.0) for one in arrays), "its arrays", LESS)
+        return head["attributes"], {one["name"]: (pipe.array(one), one["attributes"]) for one in arrays}
+
+
+@contextmanager
+def open_hdf5(path: str | os.PathLike[str]) -> Iterator[Hdf5Content]:
+    """Open an HDF5 file of any origin, of which only what is asked for is read.
+
+    A child process reads it, so that a damaged file cannot crash or block this process. References to other files
+    (links, external storage, virtual datasets) and plugins of HDF5 are refused.
+
+    Raises
+    ------
+    ValueError, OSError
+        As `read_container`, here and from each access to the content.
+    """
+    with _reading("h5", Path(path), "asked") as (pipe, head):
+        yield Hdf5Content(pipe, head)
+
+
+class Hdf5Content(Mapping[str, "Hdf5Array"]):
+    """The arrays of numbers of an open HDF5 file by name; ValueError for another object, and for references.
+
+    Attributes
+    ----------
+    attrs : dict
+        Attributes of the file that are numbers or texts; empty ones are missing.
+    """
+
+    def __init__(self, pipe: _Pipe, head: dict[str, Any]) -> None:
+        self._pipe = pipe
+        self._found = {one["name"]: one for one in head["arrays"]}
+        self.attrs = head["attributes"]
+
+    def __getitem__(self, name: str) -> Hdf5Array:
+        found = self._found[name]
+        if "problem" in found:
+            raise ValueError(found["problem"])
+        return Hdf5Array(self._pipe, found)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._found)
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+
+class Hdf5Array:
+    """An array of an open HDF5 file, of which ``array[()]`` reads all numbers and ``array[rows]`` ascending rows.
+
+    Attributes
+    ----------
+    shape : tuple of int
+    dtype : dtype
+    attrs : dict
+        As of `Hdf5Content`.
+    """
+
+    def __init__(self, pipe: _Pipe, described: dict[str, Any]) -> None:
+        self._pipe = pipe
+        self._name = described["name"]
+        self.shape = tuple(described["shape"])
+        self.dtype = np.dtype(described["dtype"])
+        self.attrs = described["attributes"]
+
+    def __getitem__(self, rows: Sequence[int] | tuple[()]) -> np.ndarray:
+        shape = self.shape if rows == () else (len(rows), *self.shape[1:])
+        self._pipe.ask(self._name, None if rows == () else list(rows))
+        return self._pipe.array({"shape": shape, "block": shape, "dtype": self.dtype})
+
+
+@contextmanager
+def _reading(kind: str, path: Path, which: str) -> Iterator[tuple[_Pipe, dict[str, Any]]]:
+    """Yield the output of a child process that reads a file, and the header that it has sent."""
+    request: dict[str, Any] = {"kind": kind, "arrays": which}
+    request["modules"] = [os.path.abspath(folder) for folder in sys.path if folder]
+    with contextlib.ExitStack() as closing:
+        descriptors = ()
+        if kind == "zarr":
+            request["path"] = os.path.abspath(path)
+        else:
+            request["descriptor"] = open_descriptor(path)
+            closing.callback(os.close, request["descriptor"])
+            descriptors = (request["descriptor"],)
+        command = [_python(), "-I", "-S", "-W", "ignore", _PROGRAM, json.dumps(request)]
+        alone = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"}  # no plugins of HDF5
+        child = closing.enter_context(
+            subprocess.Popen(
+                command,
+                bufsize=0,
+                stdin=subprocess.PIPE if which == "asked" else subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                cwd="/",
+                env={**os.environ, **alone},
+                pass_fds=descriptors,
+            )
+        )
+        closing.callback(child.kill)
+        pipe = _Pipe(child)
         try:
-            return _take(child)
-        finally:
-            child.kill()
+            pipe.read(1, START)
+        except (_ChildEnded, TimeoutError):
+            raise OSError(errno.ENOEXEC, f"{_python()} cannot be started to read it: {pipe.end()}") from None
+        try:
+            length = int.from_bytes(pipe.read(8), "little")
+            yield pipe, json.loads(pipe.read(length))
+        except _ChildEnded:
+            raise ValueError(pipe.end()) from None
+        except TimeoutError:
+            raise ValueError(f"nothing could be read for {STALL} s") from None
 
 
 def _python() -> str:
@@ -73,25 +173,8 @@ def _python() -> str:
     raise OSError(errno.ENOENT, f"found no program {version}, which is needed to read it; install it")
 
 
-def _take(child: subprocess.Popen[bytes]) -> tuple[dict[str, Any], Arrays]:
-    pipe = _Pipe(child)
-    try:
-        pipe.read(1, START)
-    except (_ChildEnded, TimeoutError):
-        raise OSError(errno.ENOEXEC, f"{_python()} cannot be started to read it: {pipe.end()}") from None
-    try:
-        head = json.loads(pipe.read(int.from_bytes(pipe.read(8), "little")))
-        arrays = head["arrays"]
-        refuse_over_available(sum(math.prod(one["shape"], start=8.0) for one in arrays), "its arrays", LESS)
-        return head["attributes"], {one["name"]: (pipe.array(one), one["attributes"]) for one in arrays}
-    except _ChildEnded:
-        raise ValueError(pipe.end()) from None
-    except TimeoutError:
-        raise ValueError(f"nothing could be read for {STALL} s") from None
-
-
 class _Pipe:
-    """Standard output of a child process."""
+    """Standard output of a child process, and its standard input."""
 
     def __init__(self, child: subprocess.Popen[bytes]) -> None:
         assert child.stdout
@@ -101,6 +184,14 @@ class _Pipe:
             fcntl.fcntl(self._descriptor, fcntl.F_SETPIPE_SZ, _PIPE)
         self._poll = select.poll()
         self._poll.register(self._descriptor, select.POLLIN)
+
+    def ask(self, name: str, rows: list[int] | None) -> None:
+        """Ask for the numbers of an array."""
+        assert self._child.stdin
+        try:
+            self._child.stdin.write(json.dumps([name, rows]).encode() + b"\n")
+        except BrokenPipeError:
+            raise _ChildEnded from None
 
     def fill(self, buffer: memoryview, seconds: int | None = None) -> None:
         """Fill a buffer; `_ChildEnded`, or TimeoutError after `seconds` (default: `STALL`) without a byte."""

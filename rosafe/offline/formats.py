@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rosafe.declarations.text import short_repr
-from rosafe.input import open_descriptor, open_regular
+from rosafe.input import open_regular
 from rosafe.interface import KINDS, Representation
 from rosafe.missing import require
 from rosafe.offline.containers import read_h5, read_mat73, read_zarr
@@ -254,8 +254,6 @@ def read(file_format: Format, path: Path, arrays: bool = True) -> dict[str, Any]
         require(file_format.module, f"{file_format.extension} files")
     if file_format.folder and not path.is_dir():
         raise ValueError(f"{path}: expected a directory, got a file")
-    if not file_format.folder:
-        os.close(open_descriptor(path))  # HDF5 would open other files than regular ones
     try:
         result = checked(file_format.read(path, arrays))
     except (ValueError, OverflowError, RecursionError, MemoryError) as problem:  # json.JSONDecodeError, too

@@ -1,10 +1,13 @@
 """Program of a child process that reads HDF5 files and Zarr folders: damaged ones can crash or block their libraries.
 
-It is run by file name and imports nothing of rosafe. Its argument is a JSON object with `path`, `kind` (h5, mat or
-zarr), `arrays` (which to send: all, texts or none) and `modules` (folders to import from). It writes to standard
-output: one byte when the libraries are loaded; the length of the header (8 bytes); the header, a JSON object with
-`attributes` and a list `arrays` of `name`, `shape`, `dtype`, `block` and `attributes`; then the numbers of the arrays,
-block by block, in row-major order. On an error it writes one line to standard error and exits with status 1.
+It is run by file name and imports nothing of rosafe. Its argument is a JSON object with `kind` (h5, mat or zarr),
+`descriptor` (of the open HDF5 file) or `path` (of the Zarr folder), `arrays` (which to send: all, texts, none or
+asked) and `modules` (folders to import from). It writes to standard output: one byte when the libraries are loaded; the
+length of the header (8 bytes); the header, a JSON object with `attributes` and a list `arrays` of `name`, `shape`,
+`dtype`, `block` and `attributes`; then the numbers of the arrays, block by block, in row-major order. With `asked`, the
+list has all objects, those that cannot be sent as `name` and `problem`, and standard input has one line for each array
+to be sent: a JSON list of the name and of the rows, null for all. On an error it writes one line to standard error and
+exits with status 1.
 """
 
 from __future__ import annotations
@@ -30,12 +33,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-MAX_MEMORY = 2**31  # bytes of address space in addition to that of the libraries
+MAX_MEMORY = 2**30  # bytes of address space in addition to that of the libraries
 MAX_CHUNK = 2**28  # bytes of a chunk
 MAX_CHUNKS = 2**20  # chunks of an array
 MAX_ARRAYS = 4096  # arrays of a file
 MAX_TEXT = 2**20  # bytes of an attribute or of a file of metadata
-MAX_SIZE = 2**30  # bytes of all arrays of a small file
+MAX_TEXTS = 32  # texts of an attribute, one for each axis; all of them can be the same long text of the file
+MAX_HEADER = 2**24  # bytes of the header that is sent
+MAX_SIZE = 2**28  # bytes of all arrays of a small file
 MAX_RATIO = 1000  # bytes of all arrays divided by the bytes of a large file
 BLOCK = 2**22  # bytes, approximately, that are sent at a time
 _STALL = 20  # seconds of processor time for one block; it ends a process whose parent has died
@@ -65,7 +70,7 @@ def blocks(shape: tuple[int, ...], block: tuple[int, ...]) -> Iterator[Slices]:
 def check_array(name: str, shape: tuple[int, ...], chunks: tuple[int, ...] | None, dtype: np.dtype[Any]) -> None:
     """Raise ValueError unless an array is one of numbers with reasonable chunks (None: not chunked)."""
     if dtype.kind not in "fiu" or dtype.itemsize > 8:
-        raise ValueError(f"{name}: expected numbers of at most 64 bits, got {str(dtype)[:40]}")
+        raise ValueError(f"{name}: expected real numbers of at most 64 bits, got {str(dtype)[:40]}")
     if chunks is None:
         return
     if len(chunks) != len(shape) or not all(n >= 0 for n in shape) or not all(n > 0 for n in chunks):
@@ -85,19 +90,20 @@ def check_size(taken: float, size: int) -> None:
 # --- HDF5 ---------------------------------------------------------------------------------------------------------
 
 
-def open_h5(path: str) -> tuple[dict[str, Any], list[Array]]:
+def open_h5(descriptor: int) -> tuple[dict[str, Any], list[Array]]:
     """Return the attributes and the arrays of an HDF5 file; ValueError for references to other files."""
+    file = _h5_file(descriptor)
+    return _h5_attributes("the file", file), [_h5_array(file, name) for name in file]
+
+
+def _h5_file(descriptor: int) -> Any:
     import h5py
 
-    file = h5py.File(path, "r", locking=False)
+    file = h5py.File(open(descriptor, "rb", buffering=0, closefd=False), "r")
     _allow_no_more_files()
-    names = list(file)
-    if len(names) > MAX_ARRAYS:
-        raise ValueError(f"expected at most {MAX_ARRAYS} objects, got {len(names)}")
-    for name in names:
-        if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-            raise ValueError(f"{_quoted(name)}: expected an array, got a link")
-    return _h5_attributes("the file", file), [_h5_array(file, name) for name in names]
+    if len(file) > MAX_ARRAYS:
+        raise ValueError(f"expected at most {MAX_ARRAYS} objects, got {len(file)}")
+    return file
 
 
 def _allow_no_more_files() -> None:
@@ -109,12 +115,15 @@ def _allow_no_more_files() -> None:
     os.close(lowest)
 
 
-def _h5_array(file: Any, name: str) -> Array:
+def _h5_array(file: Any, name: str, other_attributes: bool = False) -> Array:
+    """Return an array of a file; ValueError, also for attributes of other types unless `other_attributes`."""
     import h5py
     from h5py import h5d, h5o, h5s, h5t, h5z
 
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+        raise ValueError(f"{_quoted(name)}: expected an array, got a link")
     found = h5o.open(file.id, name.encode("utf-8", "surrogateescape"))
-    name = _quoted(name) if not name.isidentifier() else name
+    name = name if name.replace(".", "_").isidentifier() else _quoted(name)
     if not isinstance(found, h5d.DatasetID):
         raise ValueError(f"{name}: expected an array")
     plan = found.get_create_plist()
@@ -127,11 +136,11 @@ def _h5_array(file: Any, name: str) -> Array:
         if plan.get_filter(index)[0] not in allowed:
             raise ValueError(f"{name}: expected a supported filter, got filter {plan.get_filter(index)[0]}")
     if found.get_type().get_class() not in (h5t.INTEGER, h5t.FLOAT):
-        raise ValueError(f"{name}: expected an array of numbers")
+        raise ValueError(f"{name}: expected an array of real numbers")
     if found.get_space().get_simple_extent_type() not in (h5s.SIMPLE, h5s.SCALAR):
         raise ValueError(f"{name}: expected an array, got an empty dataset")
     dataset = h5py.Dataset(found)
-    attributes = _h5_attributes(name, dataset)
+    attributes = _h5_attributes(name, dataset, other_attributes)
     shape, dtype = dataset.shape, dataset.dtype
     check_array(name, shape, dataset.chunks, dtype)
     chunks = dataset.chunks or (1,) * len(shape)
@@ -147,19 +156,24 @@ def _block(shape: tuple[int, ...], chunks: tuple[int, ...], itemsize: int) -> tu
     return tuple(block)
 
 
-def _h5_attributes(name: str, of: Any) -> dict[str, Any]:
-    from h5py import h5t
+def _h5_attributes(name: str, of: Any, others: bool = False) -> dict[str, Any]:
+    """Return attributes; ValueError for other types than numbers and texts, unless `others` are left out."""
+    from h5py import h5s, h5t
 
     found: dict[str, Any] = {}
     for attribute in of.attrs:
         one = of.attrs.get_id(attribute)
-        if one.get_type().get_class() not in (h5t.INTEGER, h5t.FLOAT, h5t.STRING):
+        kind, space = one.get_type().get_class(), one.get_space().get_simple_extent_type()
+        if kind not in (h5t.INTEGER, h5t.FLOAT, h5t.STRING) or space == h5s.NULL:
+            if others:
+                continue
             raise ValueError(f"{name}: expected attributes that are numbers or texts, got another type")
-        if one.get_storage_size() > MAX_TEXT:
+        texts = one.get_space().get_simple_extent_npoints() if kind == h5t.STRING else 0
+        if one.get_storage_size() > MAX_TEXT or texts > MAX_TEXTS:
             raise ValueError(f"{name}: expected attributes of at most {MAX_TEXT // 2**20} MiB, got a larger one")
         value = of.attrs[attribute]
         value = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
-        found[attribute] = value.decode() if isinstance(value, bytes) else value
+        found[attribute] = value.decode(errors="replace" if others else "strict") if isinstance(value, bytes) else value
     return found
 
 
@@ -312,10 +326,11 @@ def _quoted(name: str) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def _size_on_disk(path: str) -> int:
-    if not os.path.isdir(path):
-        return os.stat(path).st_size
-    folders = [path, *(one.path for one in os.scandir(path) if one.is_dir(follow_symlinks=False))]
+def _size_on_disk(file: int | str) -> int:
+    """Return the bytes of an open file, or of all files of a Zarr folder."""
+    if isinstance(file, int):
+        return os.fstat(file).st_size
+    folders = [file, *(one.path for one in os.scandir(file) if one.is_dir(follow_symlinks=False))]
     return sum(one.stat(follow_symlinks=False).st_size for folder in folders for one in os.scandir(folder))
 
 
@@ -335,24 +350,56 @@ def _is_text(array: Array) -> bool:
     return array.attributes.get("MATLAB_class") == "char" or math.prod(array.shape) == 1
 
 
-def send(path: str, kind: str, which: str) -> None:
+def _send_header(attributes: dict[str, Any], arrays: list[dict[str, Any]]) -> None:
+    head = json.dumps({"attributes": attributes, "arrays": arrays}).encode()
+    if len(head) > MAX_HEADER:
+        raise ValueError(f"expected attributes of at most {MAX_HEADER // 2**20} MiB together")
+    _send(memoryview(len(head).to_bytes(8, "little") + head))
+
+
+def _described(array: Array) -> dict[str, Any]:
+    return {**array._asdict(), "dtype": array.dtype.str, "read": None}
+
+
+def _send_numbers(array: Array, slices: Any) -> None:
+    _more_time()
+    data = np.ascontiguousarray(array.read(slices), array.dtype).reshape(-1)
+    _send(data.view(np.uint8).data)
+
+
+def send(file: int | str, which: str) -> None:
     """Check a file, and write its contents to the standard output."""
-    size = _size_on_disk(path)
-    attributes, arrays = open_zarr(path) if kind == "zarr" else open_h5(path)
+    size = _size_on_disk(file)
+    attributes, arrays = open_h5(file) if isinstance(file, int) else open_zarr(file)
     check_size(sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays), size)
     if which != "all":
         arrays = [one for one in arrays if which == "texts" and _is_text(one)]
-    described = [
-        {"name": a.name, "shape": a.shape, "dtype": a.dtype.str, "block": a.block, "attributes": a.attributes}
-        for a in arrays
-    ]
-    head = json.dumps({"attributes": attributes, "arrays": described}).encode()
-    _send(memoryview(len(head).to_bytes(8, "little") + head))
+    _send_header(attributes, [_described(array) for array in arrays])
     for array in arrays:
         for slices in blocks(array.shape, array.block):
-            _more_time()
-            data = np.ascontiguousarray(array.read(slices), array.dtype).reshape(-1)
-            _send(data.view(np.uint8).data)
+            _send_numbers(array, slices)
+
+
+def answer(descriptor: int) -> None:
+    """Write the parts of an HDF5 file that the standard input asks for."""
+    size, file = _size_on_disk(descriptor), _h5_file(descriptor)
+    arrays, described = {}, []
+    for name in file:
+        try:
+            arrays[name] = _h5_array(file, name, other_attributes=True)
+            described.append({**_described(arrays[name]), "name": name})
+        except Exception as problem:  # as in `main`; it matters only if this object is needed
+            described.append({"name": name, "problem": _reason(problem)})
+    _send_header(_h5_attributes("the file", file, others=True), described)
+    for line in sys.stdin:
+        name, rows = json.loads(line)
+        shape = arrays[name].shape
+        check_size(math.prod(shape if rows is None else (len(rows), *shape[1:])) * arrays[name].dtype.itemsize, size)
+        _send_numbers(arrays[name], () if rows is None else rows)
+
+
+def _reason(problem: Exception) -> str:
+    return (str(problem).splitlines() or [type(problem).__name__])[0][:300]
 
 
 def main() -> None:
@@ -368,11 +415,14 @@ def main() -> None:
     _send(memoryview(b"+"))
     try:
         _more_time()
-        send(request["path"], request["kind"], request["arrays"])
+        if request["arrays"] == "asked":
+            answer(request["descriptor"])
+        else:
+            send(request.get("path", request.get("descriptor")), request["arrays"])
     except MemoryError:
         sys.exit(f"expected at most {MAX_MEMORY // 2**20} MiB of memory for reading it")
     except Exception as problem:  # on damaged files the libraries raise any exception
-        sys.exit((str(problem).splitlines() or [type(problem).__name__])[0][:300])
+        sys.exit(_reason(problem))
 
 
 if __name__ == "__main__":

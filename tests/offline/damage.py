@@ -46,12 +46,15 @@ class Forked:
     def __init__(self, args: list[str], **options: Any) -> None:
         self.args = args
         self.returncode = 0
-        (read, write), (read_error, write_error) = os.pipe(), os.pipe()
+        (read, write), (read_error, write_error), (asked, ask) = os.pipe(), os.pipe(), os.pipe()
         self._child = os.fork()
         if not self._child:
-            for number, descriptor in enumerate((os.open(os.devnull, os.O_RDONLY), write, write_error)):
+            for number, descriptor in enumerate((asked, write, write_error)):
                 os.dup2(descriptor, number)
-            os.closerange(3, 200)
+            for number in {*range(3, 200)} - {*options["pass_fds"]}:
+                with contextlib.suppress(OSError):
+                    os.close(number)
+            sys.stdin = open(0)  # noqa: SIM115
             sys.argv = args[args.index(containers._PROGRAM) :]
             status = 1
             try:
@@ -63,6 +66,8 @@ class Forked:
                 os._exit(status)
         os.close(write)
         os.close(write_error)
+        os.close(asked)
+        self.stdin = open(ask, "wb", buffering=0)  # noqa: SIM115
         self.stdout = open(read, "rb", buffering=0)  # noqa: SIM115
         self._error = open(read_error, "rb")  # noqa: SIM115
 
@@ -71,6 +76,7 @@ class Forked:
 
     def __exit__(self, *_: object) -> None:
         self._wait()
+        self.stdin.close()
         self.stdout.close()
         self._error.close()
 
