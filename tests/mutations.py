@@ -965,9 +965,9 @@ MUTATIONS = (
         "]",
         "tests/packaging/test_kernels.py",
     ),
-    _dsp(
+    Mutation(
         "kernels-writable-by-others",
-        "kernels/build.py",
+        "rosafe/trust.py",
         "found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX",
         "False",
         "tests/packaging/test_kernels.py",

@@ -211,6 +211,8 @@ def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
                     say(line)
                 return 1 if report is None or report.problems else 0
             path = noise_calibration.file_of(settings.noise) or noise_calibration.default_path()
+            if path is None:
+                raise ValueError("--noise: expected a file, as there is no cache folder of this user alone, got none")
             noise_measurement.calibrate(listener, options.calibrate_noise, path, say)
     except (NoFramesError, ValueError, OSError, OutputError) as problem:
         raise CommandError(printable(str(problem))) from None

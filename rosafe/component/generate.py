@@ -34,7 +34,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from rosafe import missing
+from rosafe import missing, trust
 from rosafe.declarations import plugins
 from rosafe.output import sync_tree
 from rosafe.terminal import printable
@@ -249,10 +249,11 @@ def _generation() -> Path | None:
     if found is None:
         return None
     name = digest(found)
-    cache = paths.user_cache() / "messages"
-    bases = (cache,) if paths.source_root() is None else (found.packages["rosAFE"] / ".generated", cache)
+    cache = trust.user_cache()
+    bases = [] if paths.source_root() is None else [found.packages["rosAFE"] / ".generated"]
+    bases += [] if cache is None else [cache / "messages"]
     # Folders that other users can write are not used: their content may be code of those users.
-    places = [base for base in bases if not paths.foreign(base) and not paths.foreign(base / name)]
+    places = [base for base in bases if not trust.foreign(base) and not trust.foreign(base / name)]
     for base in places:
         readable = os.access(base / name / "python" / "rosAFE" / "__init__.py", os.R_OK)
         if readable and (found.plugins or _is_current(base, name) or not paths.writable(base)):

@@ -1,4 +1,4 @@
-"""Interaural cues of frames, quantized for the tables of a direction model."""
+"""Interaural cues of frames, quantized for the tables of a direction model; the representations that they come from."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.interface.arguments import check_parameters
+from rosafe.offline.stream import Stream
 
 KINDS = ("itd", "ild", "ic", "ratemap")  # the representations that localization needs
 # Sound is amplified by 100 dB: the representations add a small constant to energies, which would matter at low levels.
@@ -19,10 +21,35 @@ ILD_BINS, MAX_ILD = 61, 30.0  # dB
 COHERENCE_CLASSES = 6
 COHERENCE_RANGE = 2.6  # decades of 1 - coherence below 1
 LEVEL_CLASSES, LEVEL_STEP = 8, 2.0  # level of a channel above its floor in the window, dB
+MAX_CHANNELS = 128  # of a model
 CLASSES = COHERENCE_CLASSES * LEVEL_CLASSES
 FLOOR_QUANTILE = 0.02  # of the levels in a window: the floor
 MAX_VALUE = 1e100  # of a feature: sums of larger ones overflow
 MIN_LEVEL = -130.0  # dB, of the ratemap of a sound with full scale 1; channels below have no cues
+
+
+def describe(sample_rate: float, parameters: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the description, as of `Stream.describe`, of the representations for localization.
+
+    ValueError if the frames of the representations have different hops or windows, or if there are too many channels.
+    """
+    described = Stream(sample_rate, {**PARAMETERS, **check_parameters(parameters)}, list(KINDS)).describe()
+    values = described["parameters"]
+    for name in ("wSizeSec", "hSizeSec"):
+        if len({values[f"{prefix}_{name}"] for prefix in ("cc", "ild", "rm")}) > 1:
+            raise ValueError(f"parameters: expected equal values of cc_{name}, ild_{name} and rm_{name}")
+    if values["rm_scaling"] != "power":
+        raise ValueError(f"rm_scaling: expected 'power' for localization, got {values['rm_scaling']!r}")
+    if len(described["fb_cfHz"]) > MAX_CHANNELS:
+        raise ValueError(
+            f"fb_nChannels: expected at most {MAX_CHANNELS} for localization, got {len(described['fb_cfHz'])}"
+        )
+    return described
+
+
+def model_parameters(described: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters that a model depends on: all but the normalization of integer input."""
+    return {name: value for name, value in described["parameters"].items() if not name.startswith("in_")}
 
 
 class Cues(NamedTuple):

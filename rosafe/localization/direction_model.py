@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
-import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import short_repr
 from rosafe.dsp import kernels
 from rosafe.dsp.numeric_limits import FloatArray
-from rosafe.input import open_regular
-from rosafe.localization import angles
+from rosafe.localization import angles, cues
 from rosafe.localization.cues import (
     CLASSES,
     COHERENCE_CLASSES,
@@ -37,6 +35,9 @@ from rosafe.localization.cues import (
     floors,
     level_class,
 )
+from rosafe.localization.sofa import MAX_RATE, MIN_RATE
+from rosafe.offline.readers import open_npz
+from rosafe.offline.result_metadata import MAX_TEXT, from_json
 from rosafe.output import new_file
 from rosafe.terminal import printable
 
@@ -45,19 +46,8 @@ WINDOW = 100  # frames for which a floor is estimated while learning
 _SMOOTHING = 0.75  # bins, along ITD and ILD
 _CLASS_SMOOTHING = 0.5  # classes
 _PRIOR_COUNT = 10.0  # frames that the distribution over all directions counts for
-# Exceptions of the reader of npz archives, and of the conversion of their content, for damaged files
-_DAMAGED = (
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    EOFError,
-    ArithmeticError,
-    zipfile.BadZipFile,
-    zlib.error,
-    RuntimeError,
-)
+MAX_GAIN_DB = 1000.0
+MAX_LOG_RATIO = 100.0
 
 
 class DirectionModel:
@@ -168,32 +158,64 @@ class DirectionModel:
         """
         name = printable(os.fspath(path))
         try:
-            with open_regular(Path(path).expanduser()) as file, np.load(file, allow_pickle=False) as archive:
-                description = json.loads(str(archive["description"]))
-                tables = archive["itd_table"], archive["ild_table"]
-            if description.get("format") != FORMAT:
-                raise ValueError(f"format {short_repr(description.get('format'))}")
-            model = cls(description, *tables)
-            model.check_tables()
+            with open_npz(Path(os.path.expanduser(path))) as (members, read):
+                missing = {"description", "itd_table", "ild_table"} - members.keys()
+                if missing:
+                    raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+                if members["description"].file_size > MAX_TEXT:
+                    raise ValueError(f"description: expected at most {MAX_TEXT} bytes")
+                description = _checked_description(from_json(str(read(members["description"], ()))))
+                rows = description.pop("channels") * CLASSES
+                tables = [
+                    _checked_table(read(members[table], (rows * bins + 1, len(angles.grid()))), table)
+                    for table, bins in (("itd_table", ITD_BINS), ("ild_table", ILD_BINS))
+                ]
+            return cls(description, *tables)
         except FileNotFoundError:
             raise ValueError(f"{name}: expected a learned model, got a missing file") from None
-        except _DAMAGED as problem:
+        except (OSError, ValueError) as problem:
             reason = getattr(problem, "strerror", None) or str(problem)
             raise ValueError(
-                f"{name}: expected a model of rosafe head learn, got another or a damaged file: {short_repr(reason)}"
+                f"{name}: expected a model of rosafe head learn, got another or a damaged file: "
+                f"{printable(reason)[:300]}; learn it again"
             ) from None
-        return model
 
-    def check_tables(self) -> None:
-        """Raise ValueError if the tables do not belong together or to the parameters."""
-        if self.channels != self.parameters["fb_nChannels"]:
-            raise ValueError(f"tables of {self.channels} channels for {self.parameters['fb_nChannels']}")
-        rows = self.channels * CLASSES
-        expected = (rows * ITD_BINS + 1, len(self.azimuths)), (rows * ILD_BINS + 1, len(self.azimuths))
-        if (self.itd_table.shape, self.ild_table.shape) != expected or not self.channels:
-            raise ValueError("tables of unexpected shape")
-        if not (np.isfinite(self.itd_table).all() and np.isfinite(self.ild_table).all()):
-            raise ValueError("tables that are not finite")
+
+def _checked_description(found: Any) -> dict[str, Any]:
+    """Return the description in a file with the number of `channels`; ValueError unless learning could write it."""
+    if not isinstance(found, dict) or found.get("format") != FORMAT:
+        raise ValueError(f"expected the format {FORMAT!r}")
+    for key, fits in _DESCRIPTION.items():
+        if key not in found or not fits(found[key]):
+            raise ValueError(f"{key}: expected another value, got {short_repr(found.get(key))}")
+    parameters = found["parameters"]
+    described = cues.describe(found["sample_rate"], parameters)
+    effective = cues.model_parameters(described)
+    if missing := sorted(effective.keys() - parameters.keys()):
+        raise ValueError(f"parameters: expected {missing[0]}, got none")
+    for key, value in parameters.items():
+        if value != effective.get(key) and key not in _OF_CHANNELS:
+            raise ValueError(f"{key}: expected {short_repr(effective.get(key))}, got {short_repr(value)}")
+    return {**found, "channels": len(described["fb_cfHz"])}
+
+
+_OF_CHANNELS = ("fb_lowFreqHz", "fb_highFreqHz", "fb_nERBs")  # without effect, as fb_cfHz is given
+_DESCRIPTION: dict[str, Callable[[Any], bool]] = {
+    "sample_rate": lambda found: is_number(found) and MIN_RATE <= found <= MAX_RATE,
+    "parameters": lambda found: isinstance(found, dict),
+    "head": lambda found: isinstance(found, str),
+    "is_sphere": lambda found: isinstance(found, bool),
+    "level_gain_db": lambda found: is_number(found) and abs(found) <= MAX_GAIN_DB,
+}
+
+
+def _checked_table(table: np.ndarray, name: str) -> np.ndarray:
+    """Return a table of a file; ValueError unless learning could write it."""
+    if table.dtype != np.float16:
+        raise ValueError(f"{name}: expected numbers of type float16, got {table.dtype}")
+    if not (np.abs(table) <= MAX_LOG_RATIO).all() or table[-1].any():
+        raise ValueError(f"{name}: expected log-likelihood ratios up to {MAX_LOG_RATIO:g}, and 0 in the last row")
+    return table
 
 
 class Histograms:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from fractions import Fraction
 from functools import lru_cache
@@ -17,8 +18,9 @@ from rosafe.dsp.erb import bandwidth
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 from rosafe.localization.filters import HOP, HeadFilters, SourceRenderer
-from rosafe.localization.sofa import MAX_RATE, MIN_RATE, read_sofa
+from rosafe.localization.sofa import MAX_NUMBERS, MAX_RATE, MIN_RATE, read_sofa
 from rosafe.localization.sphere import sphere_responses
+from rosafe.terminal import printable
 
 _SYMMETRY = 1e-6  # of the energy; below, two ears count as mirrored
 _CUE_RATE = 48000.0  # Hz, at which the cues of the sphere are computed
@@ -121,6 +123,12 @@ class Head:
             return HeadFilters(self.azimuths, sphere_responses(self.azimuths, sample_rate))
         ratio = Fraction(sample_rate / self._rate).limit_denominator(1000)
         responses = self._responses
+        numbers = math.ceil(responses.size * ratio)
+        if numbers > MAX_NUMBERS:
+            raise ValueError(
+                f"{printable(self.name)}: expected responses of at most {MAX_NUMBERS} numbers at {sample_rate:g} Hz, "
+                f"got {numbers}; use a head with fewer directions or shorter responses, or a lower sample rate"
+            )
         if ratio != 1:
             responses = scipy.signal.resample_poly(responses, ratio.numerator, ratio.denominator, axis=-1) / float(
                 ratio

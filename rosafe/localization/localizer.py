@@ -12,7 +12,7 @@ import numpy as np
 from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.numeric_limits import FloatArray
-from rosafe.localization import angles, cues, training
+from rosafe.localization import angles, cues
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.evidence import EvidenceWindow
 from rosafe.localization.head import Head, checked_rate
@@ -257,7 +257,7 @@ def _checked_model(model: DirectionModel, sample_rate: float, parameters: Mappin
             f"sample_rate: expected {model.sample_rate:g} Hz, for which the model was learned, got {sample_rate:g}"
         )
     if parameters is not None:
-        values = training.model_parameters(training.describe(sample_rate, parameters))
+        values = cues.model_parameters(cues.describe(sample_rate, parameters))
         for name in parameters:
             learned = model.parameters.get(name, values.get(name))
             if values.get(name) != learned:

@@ -13,20 +13,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rosafe.localization import training
+from rosafe.localization import cues
 from rosafe.localization.direction_model import FORMAT, DirectionModel
 from rosafe.localization.head import Head
 from rosafe.localization.training import Progress, learn_head
 from rosafe.output import OutputError
+from rosafe.trust import foreign, user_cache
 
 VERSION = 3  # of the method; another one makes models on disk obsolete
 _models: weakref.WeakKeyDictionary[Head, dict[str, DirectionModel]] = weakref.WeakKeyDictionary()
 
 
-def folder() -> Path:
-    """Return the folder of learned models."""
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "rosafe"
+def folder() -> Path | None:
+    """Return the folder of learned models; None if there is none, or if other users can write it."""
+    found = user_cache()
+    return None if found is None or foreign(found) else found
 
 
 def model_of(
@@ -34,35 +35,43 @@ def model_of(
 ) -> DirectionModel:
     """Return the model of a head, learned if there is none yet.
 
-    A cache that cannot be read or written is ignored.
+    A cache that cannot be read or written, or that other users can write, is ignored.
     """
     sample_rate = float(sample_rate)  # 44100 and 44100.0 have the same model
-    described = training.describe(sample_rate, parameters)
-    values = training.model_parameters(described)
+    described = cues.describe(sample_rate, parameters)
+    values = cues.model_parameters(described)
     text = json.dumps([FORMAT, VERSION, head.key, sample_rate, values], sort_keys=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:32]
     known = _models.setdefault(head, {})
     if key not in known:
-        path = folder() / f"head-{key}.npz"
-        known[key] = _from_disk(path, sample_rate, values) or _learn(head, sample_rate, parameters, path, progress)
+        cache = folder()
+        path = cache / f"head-{key}.npz" if cache else None
+        known[key] = _from_disk(path, head, sample_rate, values) or _learn(head, sample_rate, parameters, path, progress)
     return known[key]
 
 
-def _from_disk(path: Path, sample_rate: float, values: Mapping[str, Any]) -> DirectionModel | None:
+def _from_disk(
+    path: Path | None, head: Head, sample_rate: float, values: Mapping[str, Any]
+) -> DirectionModel | None:
+    if path is None or path.is_symlink() or foreign(path):
+        return None
     with contextlib.suppress(ValueError, OSError):
         model = DirectionModel.load(path)
-        if model.sample_rate == sample_rate and model.parameters == values:
+        if (model.head, model.sample_rate, model.parameters) == (head.key, sample_rate, values):
             return model
     return None
 
 
 def _learn(
-    head: Head, sample_rate: float, parameters: Mapping[str, Any] | None, path: Path, progress: Progress | None
+    head: Head, sample_rate: float, parameters: Mapping[str, Any] | None, path: Path | None, progress: Progress | None
 ) -> DirectionModel:
     model = learn_head(head, sample_rate, parameters, progress or terminal_progress(head.name))
-    with contextlib.suppress(OSError, OutputError):
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        model.save(path)
+    if path is not None:
+        with contextlib.suppress(OSError, OutputError):
+            path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            if path.is_symlink():
+                path.unlink()
+            model.save(path)
     return model
 
 

@@ -15,12 +15,10 @@ import scipy.fft
 import scipy.signal
 
 from rosafe.dsp.numeric_limits import FloatArray
-from rosafe.interface.arguments import check_parameters
 from rosafe.localization import angles, cues
 from rosafe.localization.direction_model import DirectionModel, Histograms
 from rosafe.localization.head import Head
 from rosafe.offline.process import process
-from rosafe.offline.stream import Stream
 
 SNR_DB = (30.0, 20.0, 12.0, 6.0, 2.0, -2.0, -6.0)
 # Noise without modulation, whose level is near its floor although nothing disturbs it: a small part of the sounds, as
@@ -34,26 +32,6 @@ _SKIP_SECONDS = 0.05  # at the beginning of a sound, until the filters have sett
 _MODULATION_RATE = 100.0  # Hz, of the sampled envelopes
 _LEVEL = 0.05  # RMS of the training sounds
 Progress = Callable[[float], None]
-
-
-def describe(sample_rate: float, parameters: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the description, as of `Stream.describe`, of the representations for localization.
-
-    ValueError if the frames of the representations have different hops or windows.
-    """
-    described = Stream(sample_rate, {**cues.PARAMETERS, **check_parameters(parameters)}, list(cues.KINDS)).describe()
-    values = described["parameters"]
-    for name in ("wSizeSec", "hSizeSec"):
-        if len({values[f"{prefix}_{name}"] for prefix in ("cc", "ild", "rm")}) > 1:
-            raise ValueError(f"parameters: expected equal values of cc_{name}, ild_{name} and rm_{name}")
-    if values["rm_scaling"] != "power":
-        raise ValueError(f"rm_scaling: expected 'power' for localization, got {values['rm_scaling']!r}")
-    return described
-
-
-def model_parameters(described: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters that a model depends on: all but the normalization of integer input."""
-    return {name: value for name, value in described["parameters"].items() if not name.startswith("in_")}
 
 
 def learn_head(
@@ -128,8 +106,8 @@ def count(
 
     Returns the histograms and the description of the model.
     """
-    described = describe(sample_rate, parameters)
-    values = model_parameters(described)
+    described = cues.describe(sample_rate, parameters)
+    values = cues.model_parameters(described)
     histograms = Histograms(len(described["fb_cfHz"]), len(azimuths))
     skip = int(np.ceil(_SKIP_SECONDS * described["itd_frameRate"]))
     powers = np.zeros(2)  # of the sounds, and of their ratemaps

@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from rosafe.localization import model_cache
 from rosafe.localization.localizer import Localizer
 from rosafe.localization.noise import NoiseCalibration
 from rosafe.localizer_node.status import OK, WARN, NodeStatus
+from rosafe.trust import foreign
 
 NO_FILE = "none"  # the value of ~noise without a file
 # Levels of 0.1 s after which sound that has been steady since the start is noise. In a recording it may be a source.
 WARM_UP = 2
 
 
-def default_path() -> Path:
-    """Return the file that is used if no other is named."""
-    return model_cache.folder() / "noise.json"
+def default_path() -> Path | None:
+    """Return the file that is used if no other is named; None if there is no cache folder of this user alone."""
+    folder = model_cache.folder()
+    path = folder / "noise.json" if folder else None
+    return None if path is None or path.is_symlink() or foreign(path) else path
 
 
 def file_of(setting: str) -> Path | None:
     """Return the file for a value of ~noise; None if no file is to be used."""
     if setting == NO_FILE:
         return None
-    return Path(setting).expanduser() if setting else default_path()
+    return Path(os.path.expanduser(setting)) if setting else default_path()
 
 
 class StoredNoise:

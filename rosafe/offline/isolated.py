@@ -41,7 +41,7 @@ MAX_TEXT = 2**20  # bytes of an attribute or of a file of metadata
 MAX_TEXTS = 32  # texts of an attribute, one for each axis; all of them can be the same long text of the file
 MAX_HEADER = 2**24  # bytes of the header that is sent
 MAX_SIZE = 2**28  # bytes of all arrays of a small file
-MAX_RATIO = 1000  # bytes of all arrays divided by the bytes of a large file
+MAX_RATIO = 250  # bytes of all arrays divided by the bytes of a large file; silence in a Zarr has 240
 BLOCK = 2**22  # bytes, approximately, that are sent at a time
 _STALL = 20  # seconds of processor time for one block; it ends a process whose parent has died
 
@@ -120,10 +120,11 @@ def _h5_array(file: Any, name: str, other_attributes: bool = False) -> Array:
     import h5py
     from h5py import h5d, h5o, h5s, h5t, h5z
 
+    shown = name if name.replace(".", "_").isidentifier() else _quoted(name)
     if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-        raise ValueError(f"{_quoted(name)}: expected an array, got a link")
+        raise ValueError(f"{shown}: expected an array, got a link")
     found = h5o.open(file.id, name.encode("utf-8", "surrogateescape"))
-    name = name if name.replace(".", "_").isidentifier() else _quoted(name)
+    name = shown
     if not isinstance(found, h5d.DatasetID):
         raise ValueError(f"{name}: expected an array")
     plan = found.get_create_plist()

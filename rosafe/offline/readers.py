@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import re
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
 import numpy as np
 
+from rosafe.declarations.text import short_repr
 from rosafe.input import open_regular
 from rosafe.offline.in_memory_formats import CSV_HEAD
 from rosafe.offline.memory import check_arrays
@@ -42,18 +45,25 @@ _MAX_CSV_HEAD = 2**24  # bytes
 
 def read_npz(path: Path, arrays: bool = True) -> dict[str, Any]:
     """Return the contents of an .npz; without `arrays`, only the metadata. ValueError if it is damaged."""
+    with open_npz(path) as (members, read):
+        found = {name: read(one) for name, one in members.items() if arrays or name in ABOUT}
+    return {**found, **parse_metadata({name: value for name, value in found.items() if value.ndim == 0})}
+
+
+@contextmanager
+def open_npz(path: Path) -> Iterator[tuple[dict[str, zipfile.ZipInfo], Callable[..., np.ndarray]]]:
+    """Yield the members of an .npz by name, and `read_array` for them; ValueError, also later, if it is damaged."""
     with open_regular(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         try:
             with zipfile.ZipFile(stream) as file:
-                found = {name: _member(file, one) for name, one in _members(file, size, arrays)}
+                yield _members(file, size), functools.partial(_read_array, file)
         except _DAMAGED as problem:
             raise ValueError(str(problem)[:300]) from None
-    return {**found, **parse_metadata({name: value for name, value in found.items() if value.ndim == 0})}
 
 
-def _members(file: zipfile.ZipFile, size: int, arrays: bool) -> Iterator[tuple[str, zipfile.ZipInfo]]:
-    """Yield names and members of the arrays to be read, after a check of the total size."""
+def _members(file: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
+    """Return the members of a file of `size` bytes, after a check of their total size."""
     members = file.infolist()
     if len(members) > _MAX_MEMBERS:
         raise ValueError(f"expected at most {_MAX_MEMBERS} arrays, got {len(members)}")
@@ -61,14 +71,11 @@ def _members(file: zipfile.ZipFile, size: int, arrays: bool) -> Iterator[tuple[s
         if one.flag_bits & _ENCRYPTED or one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise ValueError("expected arrays that are stored or deflated, and not encrypted")
     check_arrays(0, size, sum(one.file_size for one in members))
-    for one in members:
-        name = one.filename.removesuffix(".npy")
-        if arrays or name in ABOUT:
-            yield name, one
+    return {one.filename.removesuffix(".npy"): one for one in members}
 
 
-def _member(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """Read an array in numpy's format."""
+def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo, expected: tuple[int, ...] | None = None) -> np.ndarray:
+    """Read an array in numpy's format; ValueError if its shape is not the `expected` one."""
     with file.open(member) as content:
         version = content.read(8)
         width = 2 if version[6:7] == b"\x01" else 4
@@ -79,6 +86,8 @@ def _member(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         if not header:
             raise ValueError(f"{member.filename[:80]!r}: expected an array of numbers, or a text")
         dtype, shape = np.dtype(header[1]), tuple(int(n) for n in re.findall(r"\d+", header[3]))
+        if expected is not None and shape != expected:
+            raise ValueError(f"{member.filename[:80]!r}: expected the shape {expected}, got {short_repr(shape)}")
         size = math.prod(shape) * dtype.itemsize
         if member.file_size != len(version) + width + length + size or (shape and dtype.kind == "U"):
             raise ValueError(f"{member.filename[:80]!r}: expected {size} bytes by its shape, got another length")

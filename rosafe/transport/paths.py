@@ -57,12 +57,6 @@ def prefer_pypi_packages() -> None:
         put_ahead(PYPI_DIR)
 
 
-def user_cache() -> Path:
-    """Return the user's folder for files that can be generated again."""
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(base) if os.path.isabs(base) else Path(os.path.expanduser("~"), ".cache")) / "rosafe"
-
-
 def private_temporary() -> Path:
     """Return a private folder of this user in /tmp, always the same one, for files without another writable place.
 
@@ -87,13 +81,3 @@ def writable(directory: Path) -> bool:
             return True
     except OSError:
         return False
-
-
-def foreign(path: Path) -> bool:
-    """Return whether users other than root, this user and the owner of this program could have written `path`."""
-    try:
-        found = path.stat()
-    except OSError:  # it does not exist, or this user cannot read it
-        return False
-    world_writable = found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX
-    return bool(world_writable) or found.st_uid not in (0, os.getuid(), CODE_DIR.stat().st_uid)

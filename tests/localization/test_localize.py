@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import rosafe
-from rosafe.localization import model_cache, training
+from rosafe.localization import cues, model_cache, training
 from rosafe.localization.cues import KINDS
 from rosafe.localization.direction_model import DirectionModel
 from tests.localization.conftest import RATE, modulated
@@ -182,7 +182,7 @@ def test_wrong_arguments(sphere_model: Path, change: dict[str, Any], message: st
 
 @pytest.mark.parametrize("rate", [1e9, 7999.0, 1e-3])
 def test_absurd_rates_are_refused_at_once(monkeypatch: pytest.MonkeyPatch, rate: float) -> None:
-    monkeypatch.setattr(training, "describe", lambda *_: pytest.fail("computed"))
+    monkeypatch.setattr(cues, "describe", lambda *_: pytest.fail("computed"))
     with pytest.raises(ValueError, match=f"^sample_rate: expected 8000 to 768000 Hz, got {rate}$"):
         rosafe.localize(np.zeros((2, 100)), rate)
 
@@ -249,12 +249,6 @@ def test_damaged_models_are_one_line(tmp_path: Path, sphere_model: Path) -> None
     with np.load(sphere_model) as archive:
         arrays = dict(archive)
     description = json.loads(str(arrays["description"]))
-    for number in (30, "31", None):
-        description["parameters"]["fb_nChannels"] = number
-        with open(path, "wb") as file:
-            np.savez(file, **{**arrays, "description": np.array(json.dumps(description))})
-        with pytest.raises(ValueError, match="damaged file: 'tables of 31 channels for"):
-            rosafe.Localizer(RATE, path)
     fifo = tmp_path / "fifo.head"
     os.mkfifo(fifo)
     with pytest.raises(ValueError, match="got a FIFO"):

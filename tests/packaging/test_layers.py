@@ -45,7 +45,7 @@ ALLOWED_IMPORTS: dict[str, set[str]] = {
     "demo": {"declarations", "interface", "component", "transport", "bass", "sound", "view", "localization"},
 }
 TOP = {"commands", "testing", "__init__"}  # may use everything
-EVERYWHERE = {"py", "version", "output", "input", "missing", "terminal", "streams", "option_types"}
+EVERYWHERE = {"py", "version", "output", "input", "missing", "terminal", "streams", "option_types", "trust"}
 
 
 def imports(path: Path) -> Iterator[str]:

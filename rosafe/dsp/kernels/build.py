@@ -14,11 +14,15 @@ import hashlib
 import os
 import platform
 import shutil
-import stat
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
+
+from rosafe.trust import foreign  # noqa: E402
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
@@ -87,18 +91,10 @@ def _paths(folder: Path, levels: dict[int, str]) -> dict[int, Path]:
 
 
 def _refuse_foreign(*paths: Path) -> None:
-    """Raise BuildError if users other than root, this user and the owner of this program could have written a path."""
-    for path in filter(os.path.lexists, paths):
-        found = path.stat()
-        if found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX:
-            raise BuildError(
-                f"{path}: expected that other users cannot write it, got mode {found.st_mode & 0o7777:o}; "
-                f"chmod o-w {path}"
-            )
-        if found.st_uid not in (0, os.geteuid(), HERE.stat().st_uid):
-            raise BuildError(
-                f"{path}: expected that it belongs to root or to this user, got user {found.st_uid}; remove it"
-            )
+    """Raise BuildError if other users could have written a path."""
+    for path in paths:
+        if why := foreign(path):
+            raise BuildError(why)
 
 
 def _missing_libraries(folder: Path, levels: dict[int, str]) -> list[str]:
