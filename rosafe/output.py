@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import fcntl
-import glob
 import os
-import shlex
 import shutil
 import stat
 from collections.abc import Callable, Iterator, Mapping
@@ -16,7 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 PART = ".part"  # suffix of an unfinished output
-_AT_FDCWD, _RENAME_NOREPLACE, _RENAME_EXCHANGE = -100, 1, 2  # constants of renameat2
+# Errors of flock on file systems without locks, such as NFS, Lustre, FUSE; EBADF: NFS does not lock folders
+_NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF)
 
 
 class OutputError(Exception):
@@ -31,7 +29,7 @@ class AtomicOutput:
     """An unfinished output file, named after its target with the suffix ``.part``.
 
     The name is fixed and the file is locked. A second writer of the same target is therefore rejected, and a part that
-    a killed process has left is found.
+    a killed process has left is found. On a file system without locks a second writer is not rejected.
 
     Parameters
     ----------
@@ -56,7 +54,7 @@ class AtomicOutput:
     Raises
     ------
     OutputError
-        The target exists, or another process (named in the text) is writing it, or it cannot be written.
+        The target exists, or another process is writing it, or it cannot be written.
     """
 
     def __init__(self, target: str | Path, replace: bool, keep_leftover: bool = False, mode: int = 0o666) -> None:
@@ -99,10 +97,9 @@ class AtomicOutput:
         os.fsync(self.descriptor)  # otherwise a power cut could leave an empty file of that name
         if not _is_at(self.name, self.descriptor):
             raise FileNotFoundError(errno.ENOENT, f"{self.name} has been removed")
-        if self._replace:
-            self.name.rename(self._path)
-        else:
-            _renameat2(self.name, self._path, _RENAME_NOREPLACE)
+        if not self._replace and os.path.lexists(self._path):
+            raise FileExistsError(errno.EEXIST, "it was created meanwhile")
+        os.replace(self.name, self._path)
         self.keep = True
         _sync_folder(self._path.parent)
 
@@ -184,9 +181,8 @@ def new_folder(target: str | Path, replace: bool, marker_file: str) -> Iterator[
                 raise FileNotFoundError(errno.ENOENT, f"{part} has been removed")
             if os.path.lexists(path):
                 _check_replaceable(Path(target), path, replace, marker_file)
-                _exchange(part, path)
-            else:
-                _renameat2(part, path, _RENAME_NOREPLACE)
+                shutil.rmtree(path)
+            part.rename(path)
             _sync_folder(path.parent)
         finally:
             if _is_at(part, descriptor):
@@ -212,22 +208,16 @@ def _open_folder(part: Path) -> int:
             return os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
 
 
-def _exchange(part: Path, path: Path) -> None:
-    """Replace the folder `path` by `part`.
+def lock_file(descriptor: int, wait: bool = False) -> None:
+    """Lock an open file or folder until it is closed; without effect on a file system without locks.
 
-    The old folder has the name of the part until it is removed. A lock keeps other writers from using it as a part.
+    BlockingIOError if another process has locked it, unless this function is to `wait`.
     """
-    old = _locked(path, lambda: os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW))
     try:
-        try:
-            _renameat2(part, path, _RENAME_EXCHANGE)
-        except FileExistsError:  # not supported by the file system
-            shutil.rmtree(path)
-            part.rename(path)
-        else:
-            shutil.rmtree(part, ignore_errors=True)
-    finally:
-        os.close(old)
+        fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as problem:
+        if problem.errno not in _NO_LOCKS:
+            raise
 
 
 def _locked(name: Path, open_it: Callable[[], int]) -> int:
@@ -235,13 +225,12 @@ def _locked(name: Path, open_it: Callable[[], int]) -> int:
     while True:
         descriptor = open_it()
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(descriptor)
             if _is_at(name, descriptor):
                 return descriptor
         except BlockingIOError:
-            holder = _holder(descriptor)
             os.close(descriptor)
-            raise BlockingIOError(errno.EAGAIN, f"{holder} is writing it") from None
+            raise BlockingIOError(errno.EAGAIN, "another process is writing it") from None
         except BaseException:
             os.close(descriptor)
             raise
@@ -332,20 +321,6 @@ def _real(target: str | Path) -> Path:
         raise OutputError(f"cannot write {target}: {getattr(problem, 'strerror', None) or problem}") from None
 
 
-def _renameat2(name: Path, path: Path, flag: int) -> None:
-    """Call renameat2; FileExistsError if `path` exists, or if the file system does not support the flag."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.renameat2(_AT_FDCWD, os.fsencode(name), _AT_FDCWD, os.fsencode(path), flag) == 0:
-        return
-    problem = ctypes.get_errno()
-    if problem in (errno.EINVAL, errno.ENOSYS) and not os.path.lexists(path):  # not supported, as on NFS
-        name.rename(path)
-        return
-    if problem in (errno.EINVAL, errno.ENOSYS, errno.EEXIST):
-        raise FileExistsError(errno.EEXIST, "it was created meanwhile")
-    raise OSError(problem, os.strerror(problem))
-
-
 def sync_tree(folder: Path) -> None:
     """Write a folder and all files in it to the disk, so that they survive a power cut after a rename."""
     for parent, _, names in os.walk(folder):
@@ -365,18 +340,3 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _holder(descriptor: int) -> str:
-    """Return a description of the process that has locked the file; processes of other users are not visible."""
-    locked = os.fstat(descriptor)
-    # This process is checked last: if it was forked from the writer, it has inherited the locked descriptor.
-    own = f"/proc/{os.getpid()}/"
-    for opened in map(Path, sorted(glob.iglob("/proc/[0-9]*/fd/*"), key=lambda name: name.startswith(own))):
-        with contextlib.suppress(OSError):  # closed meanwhile, or of another user
-            process = opened.parents[1]
-            if os.path.samestat(opened.stat(), locked) and "FLOCK" in (process / "fdinfo" / opened.name).read_text():
-                words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")[:-1]
-                command = shlex.join(words)[:200]
-                return f"process {process.name} ({command if command.isprintable() else 'unknown'})"
-    return "another process"

@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import compileall
 import contextlib
-import fcntl
 import functools
 import hashlib
 import importlib.util
@@ -36,7 +35,7 @@ from typing import NamedTuple
 
 from rosafe import missing, trust
 from rosafe.declarations import plugins
-from rosafe.output import sync_tree
+from rosafe.output import lock_file, sync_tree
 from rosafe.terminal import printable
 from rosafe.transport import master, paths
 
@@ -202,7 +201,7 @@ def _generate(found: Sources, base: Path, name: str) -> Path:
     generation = base / name
     base.mkdir(mode=0o755, parents=True, exist_ok=True)
     with open(base / "lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # released by the kernel even if this process is killed
+        lock_file(lock.fileno(), wait=True)  # released by the kernel even if this process is killed
         for orphan in base.glob("build-*"):  # left by a process that was killed
             shutil.rmtree(orphan)
         if not generation.is_dir():

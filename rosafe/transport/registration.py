@@ -9,7 +9,6 @@ registrations again.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import threading
 import xmlrpc.client
@@ -30,6 +29,7 @@ from rospy.impl.registration import (
     get_topic_manager,
 )
 
+from rosafe.output import lock_file
 from rosafe.transport import master, paths, server_limits
 from rosafe.transport.connector import Connector
 from rosafe.transport.succession import MasterProxy, NodeApiHandler, Succession
@@ -308,7 +308,7 @@ def _user_lock() -> Iterator[None]:
         with contextlib.suppress(OSError):  # without a temporary folder, one of them may end the others
             folder = os.open(paths.private_temporary(), os.O_RDONLY)
             stack.callback(os.close, folder)
-            fcntl.flock(folder, fcntl.LOCK_EX)  # the kernel releases it even if this process is killed
+            lock_file(folder, wait=True)  # the kernel releases it even if this process is killed
         yield
 
 

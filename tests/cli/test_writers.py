@@ -16,7 +16,7 @@ from tests.cli import forked
 from tests.cli.command import SMALL, SMALL_PARAMETERS, as_int32, noise, refused, write
 from tests.cli.command import rosafe as command
 from tests.cli.forked import process
-from tests.harness import PYTHON, ROOT, SCRIPTS, proc
+from tests.harness import PYTHON, ROOT, SCRIPTS
 
 EXTENSIONS = [".npz", ".h5", ".mat", ".zarr", ".csv"]
 
@@ -50,7 +50,6 @@ def sounds(folder: Path, count: int) -> tuple[list[Path], list[np.ndarray]]:
     [(".npz", True), (".h5", False), (".mat", True), (".zarr", False), (".zarr", True), (".csv", False)],
 )
 def test_the_second_writer_is_refused_while_the_first_one_writes(tmp_path: Path, extension: str, replace: bool) -> None:
-    proc("self")  # without it, the other process has no number
     (first, second), (expected, _) = sounds(tmp_path, 2)
     target = tmp_path / "out" / f"a{extension}"
     target.parent.mkdir()
@@ -63,8 +62,7 @@ def test_the_second_writer_is_refused_while_the_first_one_writes(tmp_path: Path,
             refusals.append(Other(second, target, replace).result())
 
     assert process(first, target, replace, meanwhile) == "done"
-    why = f"cannot write {target}: process {os.getpid()} ("
-    assert refusals and all(one.startswith(why) and one.endswith(") is writing it") for one in refusals), refusals
+    assert refusals and set(refusals) == {f"cannot write {target}: another process is writing it"}
     np.testing.assert_array_equal(rosafe.load(target)["ild"], expected)
     assert os.listdir(target.parent) == [target.name]
 
@@ -84,27 +82,6 @@ def test_many_concurrent_writers(tmp_path: Path, extension: str) -> None:
         own = [np.array_equal(rosafe.load(target)["ild"], one) for one in expected]
         assert own.count(True) == 1 and results[own.index(True)] == "done"
         assert not [name for name in os.listdir(out) if name.endswith(".part")]
-
-
-def test_a_zarr_that_is_replaced_is_not_a_part_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The old folder has the name of the part file for a moment."""
-    from rosafe import output
-
-    paths, expected = sounds(tmp_path, 2)
-    target = tmp_path / "a.zarr"
-    assert process(paths[1], target) == "done"
-    messages = []
-    exchange = output._renameat2
-
-    def renamed(*arguments: Any) -> None:
-        exchange(*arguments)
-        messages.append(Other(paths[1], target, True).result())
-
-    monkeypatch.setattr(output, "_renameat2", renamed)
-    assert process(paths[0], target, True) == "done"
-    assert len(messages) == 1 and messages[0].endswith("is writing it"), messages
-    np.testing.assert_array_equal(rosafe.load(target)["ild"], expected[0])
-    assert not (tmp_path / "a.zarr.part").exists()
 
 
 def test_files_created_meanwhile_are_kept(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ FOLDER. It does nothing if the libraries exist already.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import platform
@@ -22,6 +21,7 @@ from pathlib import Path
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
+from rosafe.output import lock_file  # noqa: E402
 from rosafe.trust import foreign  # noqa: E402
 
 HERE = Path(__file__).resolve().parent
@@ -125,7 +125,7 @@ def _build(folder: Path, levels: dict[int, str]) -> None:
     compiler = _compiler()
     base.mkdir(mode=0o755, parents=True, exist_ok=True)
     with open(base / "kernels.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # released by the system even if this process is killed
+        lock_file(lock.fileno(), wait=True)  # released by the system even if this process is killed
         for orphan in base.glob("kernels-*.new-*"):  # left by a process that was killed
             shutil.rmtree(orphan)
         if _missing_libraries(folder, levels):
