@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._parameters import (
     add_float_handling,
@@ -54,8 +55,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_preset(parser)
     add_float_handling(parser)
     parser.add_argument("--ear", choices=("left", "right"), help="draw one ear only")
-    parser.add_argument("--at", type=float, metavar="S", help="draw channels against lags, or filters, at this time")
-    parser.add_argument("--channel", type=float, metavar="HZ", help="draw lags, or filters, of this channel over time")
+    parser.add_argument("--at", type=option_types.seconds(0.0, 1e10), metavar="S", help="draw channels against lags, or filters, at this time")
+    parser.add_argument("--channel", type=option_types.number(0.0, 1e9, "a frequency in Hz"), metavar="HZ", help="draw lags, or filters, of this channel over time")
     parser.add_argument("--force", action="store_true", help="replace a picture that -o does not name")
     parser.epilog = (
         "examples:\n"

@@ -24,7 +24,7 @@ _BAND = (
     1.2,
     0.8,
 )  # relative to the lowest and highest centre frequency: the range in which causal synthesis is optimized
-_PAST_SECONDS = 0.004  # of a causal filter beyond its delay
+PAST_SECONDS = 0.004  # of a causal filter beyond its delay
 _ITERATIONS = 30
 _END_SECONDS = 0.03  # before an abrupt end: the sound that is estimated together with the outputs after it
 _MAX_END = 2048  # the same in samples
@@ -170,7 +170,7 @@ def causal_synthesis(
         Power of the error relative to the signal, with the weights of the design.
     """
     length = response_length(sample_rate, frequencies, order, width)
-    taps = delay + 1 + round(_PAST_SECONDS * sample_rate)
+    taps = delay + 1 + round(PAST_SECONDS * sample_rate)
     size = scipy.fft.next_fast_len(2 * (length + taps), real=True)
     analysis = responses(size, sample_rate, frequencies, order, width)
     bins = np.fft.rfftfreq(size, 1 / sample_rate)

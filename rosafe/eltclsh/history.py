@@ -9,9 +9,11 @@ import readline
 from pathlib import Path
 from tkinter import TclError
 
+from rosafe.input import read_regular
 from rosafe.output import OutputError, write_whole
 
 _HEADER = "_HiStOrY_V2_"  # of libedit, which the original uses; characters except graphic ASCII are written as \ooo
+_MAX_BYTES = 2**22
 _SUBCOMMANDS = ("add", "change", "event", "file", "save", "size", "clear")
 
 
@@ -48,7 +50,7 @@ class LineHistory:
 
     def _load(self) -> None:
         if self.path is not None and self.path.is_file():
-            self.replace(decode(self.path.read_text("utf-8", "replace")))
+            self.replace(decode(read_regular(self.path, _MAX_BYTES).decode("utf-8", "replace")))
 
     @property
     def entries(self) -> list[str]:

@@ -9,6 +9,9 @@ import numpy as np
 from rosafe.dsp.numeric_limits import FloatArray
 
 SPACING = 5.0  # degrees between the directions of a model
+MAX_DEGREES = 1e6  # of an azimuth that a user gives: larger ones lose precision
+MAX_TIME = 1e10  # s, of an azimuth over time: a double has microseconds up to there
+LIMITS = f"from {-MAX_DEGREES:.0f} to {MAX_DEGREES:.0f} degrees"
 
 
 def wrap(azimuths: Any) -> Any:
@@ -40,3 +43,8 @@ def unwrap(azimuths: FloatArray) -> FloatArray:
     """Return azimuths (degrees) without jumps: each differs from the one before by the shorter way round."""
     steps = difference(azimuths[1:], azimuths[:-1])
     return np.concatenate((azimuths[:1], azimuths[0] + np.cumsum(steps)))
+
+
+def in_limits(azimuths: Any) -> bool:
+    """Return whether all azimuths (degrees) are finite and at most `MAX_DEGREES`."""
+    return bool((np.abs(azimuths) <= MAX_DEGREES).all())

@@ -58,7 +58,7 @@ def direction_mask(
     Raises
     ------
     ValueError
-        For mono sound, a direction that is not finite, and as `rosafe.localize`.
+        For mono sound, a direction beyond 1e6 degrees or not finite, and as `rosafe.localize`.
 
     See Also
     --------
@@ -140,8 +140,8 @@ class _Enhancer:
         view = ears_view(sound)
         if view.shape[0] != 2:
             raise ValueError(f"sound: expected two ears, (2, N) or (N, 2), got shape {np.shape(sound)}")
-        if not is_number(azimuth) or not np.isfinite(azimuth):
-            raise ValueError(f"azimuth: expected a finite number in degrees, got {short_repr(azimuth)}")
+        if not is_number(azimuth) or not angles.in_limits(azimuth):
+            raise ValueError(f"azimuth: expected a finite number {angles.LIMITS}, got {short_repr(azimuth)}")
         self._view, self._rate = view, sample_rate
         self._model = Localizer(sample_rate, head, parameters=parameters).model
         self._distance = np.abs(angles.lateral(self._model.azimuths) - angles.lateral(azimuth))

@@ -15,7 +15,7 @@ import scipy.signal
 from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.erb import bandwidth
-from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.dsp.numeric_limits import LIMIT, FloatArray
 from rosafe.localization import angles
 from rosafe.localization.filters import HOP, HeadFilters, SourceRenderer
 from rosafe.localization.sofa import MAX_NUMBERS, MAX_RATE, MIN_RATE, read_sofa
@@ -162,10 +162,10 @@ class Head:
         if samples.ndim != 1 or samples.dtype.kind not in "iuf":
             raise ValueError(f"signal: expected numbers of shape (N,), got {samples.dtype} of shape {samples.shape}")
         samples = samples.astype(np.float64)
-        if not np.isfinite(samples).all():
-            raise ValueError("signal: expected finite samples, got NaN or infinity")
+        if not (np.abs(samples) <= LIMIT).all():
+            raise ValueError(f"signal: expected finite samples up to {LIMIT:g}, got larger ones, NaN or infinity")
         filters = self.filters(sample_rate)
-        directions = _checked_azimuth(azimuth, len(samples))
+        directions = _checked_azimuth(azimuth, samples.shape)
         if not len(samples):
             return np.empty((2, 0))
         if directions.ndim == 0:
@@ -209,8 +209,9 @@ class Head:
             raise ValueError(
                 f"frequencies: expected values above 0 and below {rate / 2:g} Hz, got {short_repr(frequencies)}"
             )
+        directions = np.atleast_1d(self.azimuths if azimuths is None else _checked_azimuth(azimuths, np.shape(azimuths)))
         filters = self.filters(rate)
-        at = filters.at(angles.wrap(np.atleast_1d(self.azimuths if azimuths is None else azimuths)))
+        at = filters.at(angles.wrap(directions))
         bins = np.fft.rfftfreq(filters.size, 1 / rate)
         distance = (bins - centers[:, np.newaxis]) / (1.019 * np.asarray(bandwidth(centers))[:, np.newaxis])
         weights = (1 + distance**2) ** -4.0  # power response of a gammatone filter of order 4
@@ -231,11 +232,12 @@ def checked_rate(sample_rate: Any) -> float:
     return float(sample_rate)
 
 
-def _checked_azimuth(azimuth: Any, count: int) -> FloatArray:
+def _checked_azimuth(azimuth: Any, shape: tuple[int, ...]) -> FloatArray:
+    """Return one azimuth, or a vector of the `shape`."""
     directions = np.asarray(azimuth)
-    fits = directions.dtype.kind in "iuf" and directions.shape in ((), (count,))
-    if not fits or not np.isfinite(directions).all():
+    fits = directions.dtype.kind in "iuf" and directions.ndim <= 1 and directions.shape in ((), shape)
+    if not fits or not angles.in_limits(directions):
         raise ValueError(
-            f"azimuth: expected one finite number in degrees, or one per sample, got {short_repr(azimuth)}"
+            f"azimuth: expected one finite number or a list of the right length, {angles.LIMITS}, got {short_repr(azimuth)}"
         )
     return directions.astype(np.float64)

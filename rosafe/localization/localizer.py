@@ -26,6 +26,7 @@ from rosafe.offline.signals import ears_view
 from rosafe.offline.stream import Stream
 
 MAX_SECONDS = 60.0
+MAX_UNITS = 2**21  # frames of channels in a window
 UPDATE_SECONDS = 0.1  # between two updates of the tracks
 TRACK_SECONDS = 0.5  # of sound for an update
 
@@ -87,6 +88,11 @@ class Localizer:
         self._window_seconds = described["parameters"]["cc_wSizeSec"]
         self._gain_db = cues.scaling_db(self.model.parameters)
         frames = max(1, round((seconds - self._window_seconds) / self.hop) + 1)
+        if frames * self.model.channels > MAX_UNITS:
+            raise ValueError(
+                f"seconds: expected at most {MAX_UNITS // self.model.channels * self.hop:g} for {self.model.channels} "
+                f"channels every {self.hop:g} s, got {seconds:g}"
+            )
         self._estimator = Estimator(self.azimuths, self.model.is_sphere)
         self._frames = frames
         self._update_frames = max(1, round(UPDATE_SECONDS / self.hop))
@@ -177,6 +183,8 @@ class Localizer:
         times = np.asarray(time, np.float64)
         if times.shape != arrays["itd"].shape[1:]:
             raise ValueError(f"time: expected shape {arrays['itd'].shape[1:]}, got {times.shape}")
+        if not (np.abs(times) <= angles.MAX_TIME).all():
+            raise ValueError(f"time: expected finite times up to {angles.MAX_TIME:g} s, got {short_repr(times)}")
         yaw = yaw_at(head_yaw, times)
         quantized = cues.quantize(arrays, self._gain_db)
         # Rows of contiguous memory: the order of a sum, and so its rounding, does not depend on the block length.
@@ -276,6 +284,8 @@ def yaw_at(head_yaw: Any, times: FloatArray) -> FloatArray:
     Between two entries the yaw is interpolated linearly, the shorter way round; outside it is held.
     """
     if is_number(head_yaw):
+        if not angles.in_limits(head_yaw):
+            raise ValueError(f"head_yaw: expected a number {angles.LIMITS}, got {short_repr(head_yaw)}")
         return np.full(len(times), float(head_yaw))
     if not isinstance(head_yaw, (Sequence, np.ndarray)) or isinstance(head_yaw, str):
         raise ValueError(f"head_yaw: expected a number or a list of [time, degrees], got {short_repr(head_yaw)}")
@@ -285,6 +295,10 @@ def yaw_at(head_yaw: Any, times: FloatArray) -> FloatArray:
         points = np.empty(0)
     if points.ndim != 2 or points.shape[1] != 2 or not len(points) or not np.isfinite(points).all():
         raise ValueError(f"head_yaw: expected finite [time, degrees], got {short_repr(head_yaw)}")
+    if not angles.in_limits(points[:, 1]) or not (np.abs(points[:, 0]) <= angles.MAX_TIME).all():
+        raise ValueError(
+            f"head_yaw: expected numbers {angles.LIMITS} and times up to {angles.MAX_TIME:g} s, got {short_repr(head_yaw)}"
+        )
     if (np.diff(points[:, 0]) < 0).any():
         raise ValueError(f"head_yaw: expected ascending times, got {short_repr(head_yaw)}")
     return np.interp(times, points[:, 0], angles.unwrap(points[:, 1]))

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from io import TextIOWrapper
 from typing import Any
 
 import numpy as np
 
 from rosafe.declarations.text import short_repr
-from rosafe.input import read_regular
+from rosafe.input import open_regular
+from rosafe.localization import angles
 from rosafe.terminal import printable
 
-MAX_TABLE = 1 << 28  # bytes
+MAX_TABLE = 1 << 26  # bytes
+MAX_LINES = 2_000_000
 YAW_COLUMNS = ("time_s", "head_yaw_deg")
 RECORDING_COLUMNS = ("file", "azimuth_deg")
 
@@ -80,8 +82,11 @@ def read_yaw(path: str | os.PathLike[str]) -> list[list[float]]:
             point = [float(time), float(yaw)]
         except ValueError:
             point = [math.nan, math.nan]
-        if not all(map(math.isfinite, point)):
-            raise ValueError(f"{printable(path)}, line {number}: expected numbers in {', '.join(YAW_COLUMNS)}")
+        if not abs(point[0]) <= angles.MAX_TIME or not angles.in_limits(point[1]):
+            raise ValueError(
+                f"{printable(path)}, line {number}: expected numbers in {', '.join(YAW_COLUMNS)}, up to {angles.MAX_TIME:g} s "
+                f"and {angles.LIMITS}, got {short_repr(f'{time},{yaw}')}"
+            )
         if points and point[0] < points[-1][0]:
             raise ValueError(f"{printable(path)}, line {number}: expected ascending times")
         if not points or point != points[-1]:  # a truth file has a line for each source
@@ -100,37 +105,39 @@ def read_recordings(path: str | os.PathLike[str]) -> list[tuple[str, float]]:
             degrees = float(azimuth)
         except ValueError:
             degrees = math.nan
-        if not file or not math.isfinite(degrees):
+        if not file or not angles.in_limits(degrees):
             got = short_repr(f"{file},{azimuth}")
-            raise ValueError(f"{printable(path)}, line {number}: expected a file and an azimuth in degrees, got {got}")
+            raise ValueError(
+                f"{printable(path)}, line {number}: expected a file and an azimuth {angles.LIMITS}, got {got}"
+            )
         recordings.append((os.path.join(folder, os.path.expanduser(file)), degrees))
     if not recordings:
         raise ValueError(f"{printable(path)}: expected lines with {', '.join(RECORDING_COLUMNS)}, got none")
     return recordings
 
 
-def _rows(path: str | os.PathLike[str], columns: tuple[str, str]) -> list[tuple[int, tuple[str, str]]]:
-    """Return number and two columns of each line of a CSV file with a header."""
+def _rows(path: str | os.PathLike[str], columns: tuple[str, str]) -> Iterator[tuple[int, tuple[str, str]]]:
+    """Yield number and two columns of each line of a CSV file with a header."""
     name = printable(os.fspath(path))
     try:
-        data = read_regular(path, MAX_TABLE + 1)
-        if len(data) > MAX_TABLE:
-            raise ValueError(f"expected at most {MAX_TABLE} bytes")
-        text = data.decode("utf-8-sig")
-        rows = [[cell.strip() for cell in row] for row in csv.reader(io.StringIO(text))]
+        with TextIOWrapper(open_regular(path), "utf-8-sig", newline="") as file:
+            if os.fstat(file.fileno()).st_size > MAX_TABLE:
+                raise ValueError(f"expected at most {MAX_TABLE >> 20} MiB")
+            rows = csv.reader(file)
+            header = [cell.strip() for cell in next(rows, [])]
+            missing = [column for column in columns if column not in header]
+            if missing:
+                got = short_repr(", ".join(header))
+                raise ValueError(f"expected the columns {', '.join(columns)}, got {got}")
+            places = [header.index(column) for column in columns]
+            for number, row in enumerate(rows, 2):
+                if number > MAX_LINES:
+                    raise ValueError(f"expected at most {MAX_LINES} lines")
+                if any(cell.strip() for cell in row):
+                    if len(row) <= max(places):
+                        raise ValueError(f"line {number}: expected {len(header)} columns, got {len(row)}")
+                    yield number, (row[places[0]].strip(), row[places[1]].strip())
     except UnicodeDecodeError:
         raise ValueError(f"{name}: expected a CSV file in UTF-8, got other bytes") from None
     except (OSError, ValueError, csv.Error) as problem:
-        raise ValueError(f"{name}: {getattr(problem, 'strerror', None) or short_repr(str(problem))}") from None
-    header = rows[0] if rows else []
-    missing = [column for column in columns if column not in header]
-    if missing:
-        raise ValueError(f"{name}: expected the columns {', '.join(columns)}, got {short_repr(', '.join(header))}")
-    places = [header.index(column) for column in columns]
-    found = []
-    for number, row in enumerate(rows[1:], 2):
-        if any(row):
-            if len(row) <= max(places):
-                raise ValueError(f"{name}, line {number}: expected {len(header)} columns, got {len(row)}")
-            found.append((number, (row[places[0]], row[places[1]])))
-    return found
+        raise ValueError(f"{name}: {getattr(problem, 'strerror', None) or printable(problem)}") from None

@@ -19,6 +19,7 @@ from rosafe.output import OutputError, write_whole
 
 FAILED = "failed.csv"
 _HEADER = ["input", "why"]
+_MAX_FAILED = 2**26  # bytes
 
 
 class FileJob(NamedTuple):
@@ -197,7 +198,7 @@ def write_failed(folder: Path, inputs: Sequence[Path], failed: Mapping[str, str]
         with TextIOWrapper(open_regular(path), "utf-8", "surrogateescape", newline="") as file:
             rows = csv.reader(file)
             try:
-                if next(rows, None) != _HEADER:
+                if os.fstat(file.fileno()).st_size > _MAX_FAILED or next(rows, None) != _HEADER:
                     raise csv.Error
                 pairs = (row for row in rows if len(row) == 2)
                 kept = {name: why for name, why in pairs if not processed & {name, *map(str, PurePath(name).parents)}}

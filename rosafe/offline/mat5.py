@@ -151,7 +151,7 @@ def _matrix(source: _Source, arrays: bool, total: int, size: int) -> tuple[str, 
         raise ValueError(f"{ascii(name)[:80]}: expected {count} numbers by its shape, got another length")
     if not (arrays or name in ABOUT):
         return name, None
-    check_arrays(total, size, count * dtype.itemsize)
+    check_arrays(total, size, count * max(dtype.itemsize, np.dtype(_CLASSES[flags & 0xFF]).itemsize))
     values = new_array((count,), dtype)
     if count and source.file.readinto(values.view(np.uint8).data) != values.nbytes:  # type: ignore[attr-defined]
         raise ValueError("it is cut off")

@@ -14,6 +14,7 @@ from rosafe.declarations.text import short_repr
 from rosafe.dsp.framing import FrameGrid
 from rosafe.dsp.gammatone_synthesis import (
     ComplexArray,
+    PAST_SECONDS,
     causal_synthesis,
     end_samples,
     outputs_after_end,
@@ -33,6 +34,9 @@ _RESPONSES = 2**23  # samples of the Fourier transforms of all channels together
 _OVERLAP = 2.5  # lengths of the longest impulse response before and after a chunk
 _MAX_COMPENSATION = 1e-4  # of the largest power response of the preprocessing: below, it is not compensated
 _DELAYS = (0.001, 1.0)  # s, of `Resynthesizer`
+_MAX_TAPS = 2**23  # of all its filters together
+_MAX_VALUE = 1e100  # of a channel: sums of larger ones overflow
+_NUMBERS = f"finite numbers up to {_MAX_VALUE:g}, got larger ones, NaN or infinity"
 _TOLERANCE = 1e-9  # of values of a mask
 
 
@@ -107,8 +111,8 @@ def _checked_result(result: Any) -> tuple[np.ndarray, FloatArray, dict[str, Any]
             f"gammatone: expected shape (ears, {len(frequencies)}, N) for {len(frequencies)} channels, "
             f"got {short_repr(channels.shape)}"
         )
-    if not all(np.isfinite(row).all() for ear in channels for row in ear):
-        raise ValueError("gammatone: expected finite numbers, got NaN or infinity")
+    if not all((np.abs(row) <= _MAX_VALUE).all() for ear in channels for row in ear):
+        raise ValueError(f"gammatone: expected {_NUMBERS}")
     return channels, frequencies, values
 
 
@@ -340,6 +344,11 @@ class Resynthesizer:
         _check_linear(values)
         if not (is_number(delay) and _DELAYS[0] <= delay <= _DELAYS[1]):
             raise ValueError(f"delay: expected {_DELAYS[0]:g} to {_DELAYS[1]:g} s, got {short_repr(delay)}")
+        highest = _MAX_TAPS / len(described["fb_cfHz"]) / (delay + PAST_SECONDS)
+        if sample_rate > highest:
+            raise ValueError(
+                f"sample_rate: expected at most {highest:.0f} Hz for a delay of {delay:g} s, got {sample_rate:g}"
+            )
         self.delay_samples = round(delay * sample_rate)
         self.delay = self.delay_samples / sample_rate
         filters, self.error_db = causal_synthesis(
@@ -381,8 +390,8 @@ class Resynthesizer:
             raise ValueError(
                 f"channels: expected shape ({' or '.join(map(str, ears))}, {count}, n), got {short_repr(block.shape)}"
             )
-        if not np.isfinite(block).all():
-            raise ValueError("channels: expected finite numbers, got NaN or infinity")
+        if not (np.abs(block) <= _MAX_VALUE).all():
+            raise ValueError(f"channels: expected {_NUMBERS}")
         length = block.shape[2]
         if mask is not None:
             weights = checked_weights(mask, len(block), count)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections.abc import Iterator
 from itertools import islice
@@ -11,11 +12,13 @@ from typing import Protocol
 
 import numpy as np
 
+from rosafe.offline.memory import check_arrays
 from rosafe.sound.audiofile import AudioFile, AudioFileError, channels_text
 from rosafe.sound.bagsound import BagSoundError, Recording, from_first_samples
 
 BAG = ".bag"
 DEFAULT_TOPIC = "/bass/Audio"
+_MAX_LOST, _MAX_LOST_SECONDS = 10, 60.0  # of a bag; lost frames are replaced by silence
 # Endings of sound files in a folder: bags, and all formats of libsndfile that have a header
 SOUNDS = frozenset(
     f".{one}"
@@ -93,6 +96,11 @@ def open_sound(
 def read_ears(path: str | Path, channels: tuple[int, int] | None = None) -> tuple[np.ndarray, int]:
     """Return the sound of both ears (2, N) in a file or a bag, and its sample rate; AudioFileError as `open_sound`."""
     with contextlib.closing(open_sound(path, channels)) as file:
+        if isinstance(file, BagSound):  # its sound can be compressed to almost nothing
+            try:
+                check_arrays(0, os.path.getsize(file.path), 8 * file.frames)
+            except (OSError, ValueError) as problem:
+                raise AudioFileError(f"{file.path}: {problem}") from None
         return file.read(file.frames), file.sample_rate
 
 
@@ -130,7 +138,14 @@ class BagSound:
                         f"`rosafe record OUT.wav --device 'bag:{self.path}?stream=2'`"
                     )
                 self.sample_rate = sample_rate
-                self.frames = sum(lost + samples.shape[1] for lost, samples in from_first_samples(pieces))
+                counts = [(lost, samples.shape[1]) for lost, samples in from_first_samples(pieces)]
+                lost, received = map(sum, zip(*counts, strict=True)) if counts else (0, 0)
+                if lost > _MAX_LOST * received + _MAX_LOST_SECONDS * sample_rate:
+                    raise AudioFileError(
+                        f"{self.path}: expected at most {_MAX_LOST} times as many lost frames as frames of sound, got "
+                        f"{lost} and {received}; extract the parts with `rosafe record`"
+                    )
+                self.frames = lost + received
         except BagSoundError as problem:
             raise AudioFileError(str(problem)) from None
         if not self.frames:

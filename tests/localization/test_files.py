@@ -7,9 +7,11 @@ import os
 import pwd
 import resource
 import shutil
+import struct
 import subprocess
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ from rosafe.localization import angles, cues, model_cache, results
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.noise import NoiseCalibration
 from rosafe.localizer_node import noise_calibration
+from rosafe.offline import isolated
 from tests.harness import PYTHON, ROOT
 from tests.localization.test_head import write_sofa
 from tests.offline.damage import change, forked
@@ -205,7 +208,7 @@ def _inflating_model(path: Path, channels: int = 128) -> None:
                 else:
                     header = {"descr": "<f2", "fortran_order": False, "shape": (3 * 10**7, 72)}
                     np.lib.format.write_array_header_1_0(member, header)
-                    for _ in range(150):
+                    for _ in range(70):
                         member.write(bytes(4 * 2**20))
 
 
@@ -216,12 +219,42 @@ def _absurd_shape(path: Path) -> None:
             archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
 
 
+def _expanding_mat(path: Path) -> None:
+    """Write bytes that MATLAB stores for numbers of the type double, compressed."""
+    count, scale = 10**8, 8
+    data = struct.pack("<IIIIIIIi", 14, 48 + count, 6, 8, 6, 0, 5, 8) + struct.pack("<iiI4s", 1, count, 4 << 16 | 1, b"axes")
+    inner = struct.pack("<II", 14, 48 + count) + data[8:] + struct.pack("<II", 2, count)
+    pack = zlib.compressobj(1)
+    packed = b"".join([pack.compress(inner), *(pack.compress(bytes(10**6)) for _ in range(count // 10**6)), pack.flush()])
+    path.write_bytes(b"MATLAB 5.0".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 15, len(packed)) + packed)
+    assert count * scale > isolated.MAX_SIZE
+
+
+def _fill_values(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file.create_dataset("ild", (31, 10**7), "f8", chunks=(31, 10**5), fillvalue=1.0)
+
+
+def _inflating_npz(path: Path) -> None:
+    np.savez_compressed(path, ild=np.zeros((36, 10**6)))
+
+
+def _sparse_csv(path: Path) -> None:
+    with open(path, "wb") as file:
+        file.write(b"time_s,head_yaw_deg\n")
+        file.truncate(4 << 30)
+
+
 _BOMBS: dict[str, tuple[Callable[[Path], None], str]] = {
     "sparse.sofa": (_sparse_sofa, "responses of at most 8388608 numbers"),
     "chunks.sofa": (_large_chunks, ""),
     "texts.sofa": (_long_texts, "expected attributes of at most 1 MiB"),
     "long.sofa": (_long_response, "768000 Hz"),
     "inflating.head": (_inflating_model, "expected less than"),
+    "inflating.npz": (_inflating_npz, "its arrays: expected less than"),
+    "expanding.mat": (_expanding_mat, "its arrays: expected less than"),
+    "fill.h5": (_fill_values, "its arrays: expected less than"),
+    "sparse.csv": (_sparse_csv, "sparse.csv: expected at most 64 MiB"),
     "shape.head": (_absurd_shape, "shape.head: expected a model"),
 }
 
@@ -230,11 +263,16 @@ _BOMBS: dict[str, tuple[Callable[[Path], None], str]] = {
 def test_small_files_do_not_take_much_memory(tmp_path: Path, name: str) -> None:
     write, words = _BOMBS[name]
     write(tmp_path / name)
-    assert (tmp_path / name).stat().st_size < 10**7 or name == "long.sofa"
+    assert 512 * (tmp_path / name).stat().st_blocks < 10**7 or name == "long.sofa"
     program = (
         "import re, resource, rosafe, sys\n"
-        "try: print(rosafe.Head.from_sofa(sys.argv[1]).filters(768000) if sys.argv[1].endswith('sofa')\n"
-        "           else rosafe.localize([[0.0] * 8000] * 2, 8000, sys.argv[1]))\n"
+        "from rosafe.localization.results import read_yaw\n"
+        "read = {\n"
+        "    'sofa': lambda path: rosafe.Head.from_sofa(path).filters(768000),\n"
+        "    'head': lambda path: rosafe.localize([[0.0] * 8000] * 2, 8000, path),\n"
+        "    'csv': read_yaw,\n"
+        "}\n"
+        "try: print(read.get(sys.argv[1].rpartition('.')[2], rosafe.load)(sys.argv[1]))\n"
         "except ValueError as problem: print(problem)\n"
         "print(re.search(r'VmHWM:\\s+(\\d+)', open('/proc/self/status').read())[1])\n"
         "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)\n"

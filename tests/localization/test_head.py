@@ -215,11 +215,19 @@ def test_other_files_are_rejected(tmp_path: Path) -> None:
         (np.zeros(5), 0, 0, "sample_rate: expected"),
         (np.zeros(5), RATE, [0, 1], "azimuth: expected"),
         (np.zeros(5), RATE, np.nan, "azimuth: expected"),
+        (np.zeros(5), RATE, 1e308, "azimuth: expected .* from -1000000 to 1000000 degrees, got 1e"),
+        (np.full(5, 1e308), RATE, 0, r"signal: expected finite samples up to 1e\+70"),
     ],
 )
 def test_arguments_of_render_are_checked(signal: np.ndarray, rate: float, azimuth: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         rosafe.Head.sphere().render(signal, rate, azimuth)
+
+
+def test_azimuths_of_cues_are_checked() -> None:
+    for azimuths in (1e308, [np.nan], [[0.0, 1.0]], ["left"]):
+        with pytest.raises(ValueError, match="azimuth: expected one finite number or a list"):
+            rosafe.Head.sphere().itd([500.0], azimuths)
 
 
 def test_rendering_nothing() -> None:

@@ -166,6 +166,9 @@ def test_clipping_is_one_warning(sphere_model: Path) -> None:
         ({"head_yaw": "left"}, "head_yaw: expected"),
         ({"head_yaw": [[1, 0], [0, 5]]}, "head_yaw: expected ascending"),
         ({"head_yaw": float("nan")}, "head_yaw: expected"),
+        ({"head_yaw": 1e308}, "head_yaw: expected a number from -1000000 to 1000000 degrees, got 1e+308"),
+        ({"head_yaw": [[0, 1], [1, -2e6]]}, "head_yaw: expected numbers from -1000000 to 1000000 degrees and times up to"),
+        ({"head_yaw": [[-1e300, 1], [1e300, 2]]}, "and times up to 1e+10 s, got [[-1e+300, 1], [1e+300, 2]]"),
         ({"head_yaw": [["a", 1]]}, "head_yaw: expected finite [time, degrees], got [['a', 1]]"),
         ({"head_yaw": [[0, 1], [2]]}, "head_yaw: expected finite [time, degrees], got"),
         ({"head_yaw": [[0, None]]}, "head_yaw: expected finite [time, degrees], got"),
@@ -207,6 +210,9 @@ def test_features_are_checked(sphere_model: Path) -> None:
         localizer.update({kind: features[kind] for kind in KINDS[:3]}, features["itd_time"])
     with pytest.raises(ValueError, match="time: expected"):
         localizer.update(features, features["itd_time"][:3])
+    for time in (np.nan, 1e300):
+        with pytest.raises(ValueError, match=r"time: expected finite times up to 1e\+10 s"):
+            localizer.update(features, np.full_like(features["itd_time"], time))
 
 
 def test_models_are_cached_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
