@@ -55,8 +55,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_preset(parser)
     add_float_handling(parser)
     parser.add_argument("--ear", choices=("left", "right"), help="draw one ear only")
-    parser.add_argument("--at", type=option_types.seconds(0.0, 1e10), metavar="S", help="draw channels against lags, or filters, at this time")
-    parser.add_argument("--channel", type=option_types.number(0.0, 1e9, "a frequency in Hz"), metavar="HZ", help="draw lags, or filters, of this channel over time")
+    parser.add_argument(
+        "--at",
+        type=option_types.seconds(0.0, 1e10),
+        metavar="S",
+        help="draw channels against lags, or filters, at this time",
+    )
+    parser.add_argument(
+        "--channel",
+        type=option_types.number(0.0, 1e9, "a frequency in Hz"),
+        metavar="HZ",
+        help="draw lags, or filters, of this channel over time",
+    )
     parser.add_argument("--force", action="store_true", help="replace a picture that -o does not name")
     parser.epilog = (
         "examples:\n"

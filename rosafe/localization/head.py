@@ -209,7 +209,9 @@ class Head:
             raise ValueError(
                 f"frequencies: expected values above 0 and below {rate / 2:g} Hz, got {short_repr(frequencies)}"
             )
-        directions = np.atleast_1d(self.azimuths if azimuths is None else _checked_azimuth(azimuths, np.shape(azimuths)))
+        directions = np.atleast_1d(
+            self.azimuths if azimuths is None else _checked_azimuth(azimuths, np.shape(azimuths))
+        )
         filters = self.filters(rate)
         at = filters.at(angles.wrap(directions))
         bins = np.fft.rfftfreq(filters.size, 1 / rate)
@@ -238,6 +240,7 @@ def _checked_azimuth(azimuth: Any, shape: tuple[int, ...]) -> FloatArray:
     fits = directions.dtype.kind in "iuf" and directions.ndim <= 1 and directions.shape in ((), shape)
     if not fits or not angles.in_limits(directions):
         raise ValueError(
-            f"azimuth: expected one finite number or a list of the right length, {angles.LIMITS}, got {short_repr(azimuth)}"
+            f"azimuth: expected one finite number or a list of the right length, {angles.LIMITS}, "
+            f"got {short_repr(azimuth)}"
         )
     return directions.astype(np.float64)

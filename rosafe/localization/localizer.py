@@ -297,7 +297,8 @@ def yaw_at(head_yaw: Any, times: FloatArray) -> FloatArray:
         raise ValueError(f"head_yaw: expected finite [time, degrees], got {short_repr(head_yaw)}")
     if not angles.in_limits(points[:, 1]) or not (np.abs(points[:, 0]) <= angles.MAX_TIME).all():
         raise ValueError(
-            f"head_yaw: expected numbers {angles.LIMITS} and times up to {angles.MAX_TIME:g} s, got {short_repr(head_yaw)}"
+            f"head_yaw: expected numbers {angles.LIMITS} and times up to {angles.MAX_TIME:g} s, "
+            f"got {short_repr(head_yaw)}"
         )
     if (np.diff(points[:, 0]) < 0).any():
         raise ValueError(f"head_yaw: expected ascending times, got {short_repr(head_yaw)}")

@@ -46,13 +46,13 @@ def model_of(
     if key not in known:
         cache = folder()
         path = cache / f"head-{key}.npz" if cache else None
-        known[key] = _from_disk(path, head, sample_rate, values) or _learn(head, sample_rate, parameters, path, progress)
+        known[key] = _from_disk(path, head, sample_rate, values) or _learn(
+            head, sample_rate, parameters, path, progress
+        )
     return known[key]
 
 
-def _from_disk(
-    path: Path | None, head: Head, sample_rate: float, values: Mapping[str, Any]
-) -> DirectionModel | None:
+def _from_disk(path: Path | None, head: Head, sample_rate: float, values: Mapping[str, Any]) -> DirectionModel | None:
     if path is None or path.is_symlink() or foreign(path):
         return None
     with contextlib.suppress(ValueError, OSError):

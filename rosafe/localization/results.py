@@ -84,8 +84,8 @@ def read_yaw(path: str | os.PathLike[str]) -> list[list[float]]:
             point = [math.nan, math.nan]
         if not abs(point[0]) <= angles.MAX_TIME or not angles.in_limits(point[1]):
             raise ValueError(
-                f"{printable(path)}, line {number}: expected numbers in {', '.join(YAW_COLUMNS)}, up to {angles.MAX_TIME:g} s "
-                f"and {angles.LIMITS}, got {short_repr(f'{time},{yaw}')}"
+                f"{printable(path)}, line {number}: expected numbers in {', '.join(YAW_COLUMNS)}, up to "
+                f"{angles.MAX_TIME:g} s and {angles.LIMITS}, got {short_repr(f'{time},{yaw}')}"
             )
         if points and point[0] < points[-1][0]:
             raise ValueError(f"{printable(path)}, line {number}: expected ascending times")

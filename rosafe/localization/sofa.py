@@ -67,7 +67,9 @@ def read_sofa(path: str | os.PathLike[str]) -> HorizontalResponses:
     except ValueError as problem:
         if str(problem).startswith(f"{name}: "):
             raise
-        raise ValueError(f"{name}: expected a SOFA file, got another or a damaged one: {_first_line(problem)}") from None
+        raise ValueError(
+            f"{name}: expected a SOFA file, got another or a damaged one: {_first_line(problem)}"
+        ) from None
     except OSError as problem:
         raise ValueError(f"{name}: {problem.strerror or _first_line(problem)}") from None
 

@@ -127,7 +127,7 @@ def _reading(kind: str, path: Path, which: str) -> Iterator[tuple[_Pipe, dict[st
     request: dict[str, Any] = {"kind": kind, "arrays": which}
     request["modules"] = [os.path.abspath(folder) for folder in sys.path if folder]
     with contextlib.ExitStack() as closing:
-        descriptors = ()
+        descriptors: tuple[int, ...] = ()
         if kind == "zarr":
             request["path"] = os.path.abspath(path)
         else:

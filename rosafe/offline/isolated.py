@@ -20,6 +20,7 @@ if __name__ == "__main__":  # the folders of the parent, before anything else is
     sys.path += [folder for folder in json.loads(sys.argv[1])["modules"] if folder not in sys.path]
 
 import codecs
+import io
 import itertools
 import json
 import math
@@ -99,7 +100,7 @@ def open_h5(descriptor: int) -> tuple[dict[str, Any], list[Array]]:
 def _h5_file(descriptor: int) -> Any:
     import h5py
 
-    file = h5py.File(open(descriptor, "rb", buffering=0, closefd=False), "r")
+    file = h5py.File(io.FileIO(descriptor, closefd=False), "r")
     _allow_no_more_files()
     if len(file) > MAX_ARRAYS:
         raise ValueError(f"expected at most {MAX_ARRAYS} objects, got {len(file)}")

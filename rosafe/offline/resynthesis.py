@@ -13,8 +13,8 @@ from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.framing import FrameGrid
 from rosafe.dsp.gammatone_synthesis import (
-    ComplexArray,
     PAST_SECONDS,
+    ComplexArray,
     causal_synthesis,
     end_samples,
     outputs_after_end,

@@ -19,7 +19,9 @@ import rosafe
 from rosafe.interface import KINDS
 from rosafe.offline import files, formats, in_memory_formats
 from rosafe.offline.files import FileResult, process_file
+from rosafe.offline.sounds import read_ears
 from rosafe.output import OutputError
+from rosafe.sound.audiofile import AudioFileError
 from rosafe.version import VERSION
 from tests.bass import bags
 from tests.cli.command import SMALL, SMALL_PARAMETERS, as_int32, noise, refused, write
@@ -342,6 +344,25 @@ def test_bags(tmp_path: Path) -> None:
     done = command("process", "a.bag", *options, "--channels", "2,1", "-o", "b.h5", cwd=tmp_path)
     assert done.returncode == 0
     np.testing.assert_array_equal(rosafe.load(tmp_path / "b.h5")["input"], expected["input"][::-1])
+
+
+def test_small_bags_with_hours_of_sound(tmp_path: Path) -> None:
+    """Silence in place of lost frames, and compressed silence that is read as a whole."""
+    samples = bags.stream(240)
+    jump = [bags.message(samples, 120, 120, 10**6), bags.message(samples, 240, 120, 10**6)]
+    jump[1].lastFrameIndex = 3 * 10**9
+    bags.write(tmp_path / "a.bag", jump)
+    refused(
+        command("process", "a.bag", *SMALL, cwd=tmp_path),
+        "a.bag: expected at most 10 times as many lost frames as frames of sound, got 2999999760 and 240",
+    )
+    window = 2**21
+    silence = [bags.message(np.zeros((2, 0), np.int32), 0, window, RATE, window) for _ in range(20)]
+    for number, message in enumerate(silence, 1):
+        message.lastFrameIndex = number * window
+    bags.write(tmp_path / "b.bag", silence, compression="bz2")
+    with pytest.raises(AudioFileError, match=r"b\.bag: its arrays: expected less than 320 MiB in a file of"):
+        read_ears(tmp_path / "b.bag")
 
 
 def test_a_bag_with_several_streams(tmp_path: Path) -> None:

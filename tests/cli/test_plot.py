@@ -120,3 +120,9 @@ def test_a_bag(tmp_path: Path) -> None:
     write(tmp_path / "y.wav", sound, 16000, "PCM_32")
     assert rosafe("plot", tmp_path / "y.wav", "--outputs", "ild", *SMALL).stderr == ""
     assert (tmp_path / "x.png").read_bytes() == (tmp_path / "y.png").read_bytes()
+
+
+def test_numbers_are_limited(tmp_path: Path) -> None:
+    for option, value in (("--at", "nan"), ("--at", "-1"), ("--channel", "1e308")):
+        done = rosafe("plot", "sound.wav", option, value, cwd=tmp_path)
+        assert done.returncode == 2 and f"{option}: expected a " in done.stderr and f"got '{value}'" in done.stderr

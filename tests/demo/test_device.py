@@ -16,7 +16,8 @@ from tests.demo.running import DEMO_SECONDS, PORTS, Demo, path, table
 
 def environment(pulse: PulseServer) -> dict[str, str]:
     """Return the environment for the sound server, with the models of heads."""
-    return {**pulse.env, "XDG_CACHE_HOME": str(model_cache.folder().parent)}
+    cache = model_cache.folder()
+    return {**pulse.env, "XDG_CACHE_HOME": str(cache.parent if cache else "")}
 
 
 def noise_from_the_left(path: Path) -> Path:

@@ -1,4 +1,4 @@
-"""SOFA files, models and the cache of models: files that refer to others, are damaged or large, or are of other users."""
+"""SOFA files, models and their cache: files that refer to others, are damaged or large, or belong to other users."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_sofa_files_that_refer_to_other_files(tmp_path: Path, words: str) -> Non
 
 
 def test_sofa_files_with_other_objects(tmp_path: Path) -> None:
-    """Groups, texts, links and attributes of any type that are not needed do not matter; empty attributes are missing."""
+    """Objects of any type that are not needed do not matter; empty attributes are missing."""
     path = write_sofa(tmp_path / "a.sofa")
     expected = rosafe.Head.from_sofa(path).key
     with h5py.File(path, "r+") as file:
@@ -222,10 +222,14 @@ def _absurd_shape(path: Path) -> None:
 def _expanding_mat(path: Path) -> None:
     """Write bytes that MATLAB stores for numbers of the type double, compressed."""
     count, scale = 10**8, 8
-    data = struct.pack("<IIIIIIIi", 14, 48 + count, 6, 8, 6, 0, 5, 8) + struct.pack("<iiI4s", 1, count, 4 << 16 | 1, b"axes")
+    data = struct.pack("<IIIIIIIi", 14, 48 + count, 6, 8, 6, 0, 5, 8) + struct.pack(
+        "<iiI4s", 1, count, 4 << 16 | 1, b"axes"
+    )
     inner = struct.pack("<II", 14, 48 + count) + data[8:] + struct.pack("<II", 2, count)
     pack = zlib.compressobj(1)
-    packed = b"".join([pack.compress(inner), *(pack.compress(bytes(10**6)) for _ in range(count // 10**6)), pack.flush()])
+    packed = b"".join(
+        [pack.compress(inner), *(pack.compress(bytes(10**6)) for _ in range(count // 10**6)), pack.flush()]
+    )
     path.write_bytes(b"MATLAB 5.0".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 15, len(packed)) + packed)
     assert count * scale > isolated.MAX_SIZE
 

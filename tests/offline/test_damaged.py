@@ -363,7 +363,8 @@ def test_hdf5_with_references_to_other_files(tmp_path: Path, good: Path, name: s
 
 def test_hdf5_cannot_open_other_files(good: Path) -> None:
     program = (
-        "import os; from rosafe.offline import isolated; file = os.open(os.environ['FILE'], os.O_RDONLY); kept = isolated.open_h5(file)\n"
+        "import os; from rosafe.offline import isolated\n"
+        "kept = isolated.open_h5(os.open(os.environ['FILE'], os.O_RDONLY))\n"
         "try: open('/etc/hostname')\nexcept OSError as problem: print(problem.errno)"
     )
     environment = {**os.environ, "FILE": str(good / "a.h5"), "PYTHONPATH": str(ROOT)}

@@ -230,9 +230,10 @@ def test_refused_arguments() -> None:
     drnl = rosafe.process(noise, rate, parameters={"fb_type": "drnl"}, outputs=["gammatone"])
     with pytest.raises(ValueError, match="DRNL filters are not linear"):
         rosafe.resynthesize(drnl)
-    result["gammatone"][0, 0, 0] = np.inf
-    with pytest.raises(ValueError, match="gammatone: expected finite numbers"):
-        rosafe.resynthesize(result)
+    for wrong in (np.inf, 1e308):
+        result["gammatone"][0, 0, 0] = wrong
+        with pytest.raises(ValueError, match="gammatone: expected finite numbers"):
+            rosafe.resynthesize(result)
     result["gammatone"] = result["gammatone"][:, 1:]
     with pytest.raises(ValueError, match="gammatone: expected shape"):
         rosafe.resynthesize(result)
@@ -295,8 +296,12 @@ def test_a_stream_with_masks_and_reset() -> None:
             resynthesizer.process(wrong)
     with pytest.raises(ValueError, match="mask: expected"):
         resynthesizer.process(channels, np.ones((channels.shape[1], 3)))
+    with pytest.raises(ValueError, match=r"sample_rate: expected at most \d+ Hz for a delay of 0\.016 s, got 1e"):
+        rosafe.Resynthesizer(1e9)
     with pytest.raises(ValueError, match="channels: expected finite numbers"):
         resynthesizer.process(np.where(channels > 0, np.nan, 0))
+    with pytest.raises(ValueError, match=r"channels: expected finite numbers up to 1e\+100"):
+        resynthesizer.process(np.full_like(channels, 1e308))
     for delay in (0, True, np.nan):
         with pytest.raises(ValueError, match="delay: expected"):
             rosafe.Resynthesizer(16000, delay=delay)
