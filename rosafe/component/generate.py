@@ -250,7 +250,7 @@ def _generation() -> Path | None:
     name = digest(found)
     cache = trust.user_cache()
     bases = [] if paths.source_root() is None else [found.packages["rosAFE"] / ".generated"]
-    bases += [] if cache is None else [cache / "messages"]
+    bases += [] if cache is None or trust.foreign(cache) else [cache / "messages"]
     # Folders that other users can write are not used: their content may be code of those users.
     places = [base for base in bases if not trust.foreign(base) and not trust.foreign(base / name)]
     for base in places:

@@ -153,13 +153,13 @@ def _run(options: argparse.Namespace, signals: _Signals, scratch: str) -> int:
     from rosafe.output import OutputError
     from rosafe.sound.audiofile import AudioFileError
     from rosafe.transport.paths import writable
-    from rosafe.trust import user_cache
+    from rosafe.trust import foreign, user_cache
 
     try:
         if not writable(options.out):
             raise scenario.DemoError(f"cannot write to {options.out}: choose another folder with --out")
         cache = user_cache()
-        kept = cache is not None and writable(cache / "matplotlib")
+        kept = cache is not None and not foreign(cache) and writable(cache / "matplotlib")
         os.environ["MPLCONFIGDIR"] = str(cache / "matplotlib") if cache and kept else scratch
         scenario.run(options.sound, options.seconds, options.out / PLOT_FILE, scratch, signals.check, signals.defer)
     except (scenario.DemoError, AudioFileError, ComponentError, GenerationError, OutputError) as problem:

@@ -56,7 +56,7 @@ def read_container(kind: str, path: Path, which: str) -> tuple[dict[str, Any], A
 
 @contextmanager
 def open_hdf5(path: str | os.PathLike[str]) -> Iterator[Hdf5Content]:
-    """Open an HDF5 file of any origin, of which only what is asked for is read.
+    """Open an HDF5 file of any origin; only those numbers are read that are asked for.
 
     A child process reads it, so that a damaged file cannot crash or block this process. References to other files
     (links, external storage, virtual datasets) and plugins of HDF5 are refused.
