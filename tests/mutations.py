@@ -547,6 +547,20 @@ MUTATIONS = (
         "tests/localization/test_localize.py -k models_are_cached",
     ),
     _localization(
+        "model-of-another-user-used",
+        "model_cache.py",
+        "path.is_symlink() or foreign(path)",
+        "False",
+        "tests/localization/test_files.py -k other_users",
+    ),
+    _localization(
+        "model-of-another-head-used",
+        "model_cache.py",
+        "(model.head, model.sample_rate, model.parameters) == (head.key, sample_rate, values)",
+        "(model.sample_rate, model.parameters) == (sample_rate, values)",
+        "tests/localization/test_files.py -k damaged_entry",
+    ),
+    _localization(
         "tracker-never-forgets",
         "tracker.py",
         "if excess > 0 else -_LOSS",
@@ -680,7 +694,7 @@ MUTATIONS = (
     Mutation(
         "output-not-locked",
         "rosafe/output.py",
-        "            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)\n",
+        "            lock_file(descriptor)\n",
         "",
         "tests/cli/test_writers.py -k second_writer",
     ),
