@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.input import open_descriptor
+from rosafe.input import open_regular
 from rosafe.offline.isolated import MAX_TEXT, blocks
 from rosafe.offline.memory import LESS, refuse_over_available
 from rosafe.offline.result_metadata import is_scalar, new_array, parse_metadata, restored
@@ -131,7 +131,8 @@ def _reading(kind: str, path: Path, which: str) -> Iterator[tuple[_Pipe, dict[st
         if kind == "zarr":
             request["path"] = os.path.abspath(path)
         else:
-            request["descriptor"] = open_descriptor(path)
+            with open_regular(path) as file:  # its number must not be that of a standard stream, which may be closed here
+                request["descriptor"] = fcntl.fcntl(file, fcntl.F_DUPFD_CLOEXEC, 3)
             closing.callback(os.close, request["descriptor"])
             descriptors = (request["descriptor"],)
         command = [_python(), "-I", "-S", "-W", "ignore", _PROGRAM, json.dumps(request)]

@@ -6,6 +6,7 @@ import functools
 import math
 import os
 import re
+import sys
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -93,6 +94,9 @@ def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo, expected: tuple[
             raise ValueError(f"{member.filename[:80]!r}: expected {size} bytes by its shape, got another length")
         array = new_array(shape, dtype, "F" if header[2] == "True" else "C")
         _fill(content, array.reshape(-1, order="A").view(np.uint8).data if size else memoryview(b""))
+        codes = array.reshape(1).view(np.dtype(np.uint32).newbyteorder(dtype.byteorder)) if dtype.kind == "U" else array
+        if dtype.kind == "U" and codes.max(initial=0) > sys.maxunicode:  # numpy would make an invalid text of it
+            raise ValueError(f"{member.filename[:80]!r}: expected a text, got codes that are no characters")
         return array
 
 

@@ -215,6 +215,16 @@ def test_zip_members(tmp_path: Path, good: Path, monkeypatch: pytest.MonkeyPatch
     refused(tmp_path / "a.npz", "its arrays: expected less than ")
 
 
+def test_codes_that_are_no_characters(tmp_path: Path, good: Path) -> None:
+    for count in (0, 1):
+        header = f"{{'descr': '<U{count}', 'fortran_order': False, 'shape': (), }}".encode()
+        with zipfile.ZipFile(good / "a.npz") as old, zipfile.ZipFile(tmp_path / "a.npz", "w") as new:
+            for one in old.namelist():
+                code = struct.pack("<I", 0x110000) * count
+                new.writestr(one, _npy(header, code) if one == "parameters.npy" else old.read(one))
+        refused(tmp_path / "a.npz", "expected a text, got codes" if count else "")
+
+
 # --- .mat of version 5 --------------------------------------------------------------------------------------------
 
 
