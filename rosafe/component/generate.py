@@ -241,6 +241,15 @@ def _is_current(base: Path, name: str) -> bool:
     return link.is_symlink() and os.readlink(link) == name and (base / name).is_dir()
 
 
+def _places(found: Sources, name: str) -> list[Path]:
+    """Return the folders of generations that other users cannot write; in the others may be code of these users."""
+    cache = trust.user_cache()
+    bases = [] if paths.source_root() is None else [found.packages["rosAFE"] / ".generated"]
+    if cache is not None and not trust.foreign(cache):
+        bases.append(cache / "messages")
+    return [base for base in bases if not trust.foreign(base) and not trust.foreign(base / name)]
+
+
 @functools.cache
 def _generation() -> Path | None:
     """Return the folder with ``python`` and ``share`` for the present sources, or None if they are installed."""
@@ -248,11 +257,7 @@ def _generation() -> Path | None:
     if found is None:
         return None
     name = digest(found)
-    cache = trust.user_cache()
-    bases = [] if paths.source_root() is None else [found.packages["rosAFE"] / ".generated"]
-    bases += [] if cache is None or trust.foreign(cache) else [cache / "messages"]
-    # Folders that other users can write are not used: their content may be code of those users.
-    places = [base for base in bases if not trust.foreign(base) and not trust.foreign(base / name)]
+    places = _places(found, name)
     for base in places:
         readable = os.access(base / name / "python" / "rosAFE" / "__init__.py", os.R_OK)
         if readable and (found.plugins or _is_current(base, name) or not paths.writable(base)):

@@ -131,7 +131,9 @@ def _reading(kind: str, path: Path, which: str) -> Iterator[tuple[_Pipe, dict[st
         if kind == "zarr":
             request["path"] = os.path.abspath(path)
         else:
-            with open_regular(path) as file:  # its number must not be that of a standard stream, which may be closed here
+            with open_regular(
+                path
+            ) as file:  # its number must not be that of a standard stream, which may be closed here
                 request["descriptor"] = fcntl.fcntl(file, fcntl.F_DUPFD_CLOEXEC, 3)
             closing.callback(os.close, request["descriptor"])
             descriptors = (request["descriptor"],)

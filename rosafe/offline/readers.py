@@ -94,10 +94,16 @@ def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo, expected: tuple[
             raise ValueError(f"{member.filename[:80]!r}: expected {size} bytes by its shape, got another length")
         array = new_array(shape, dtype, "F" if header[2] == "True" else "C")
         _fill(content, array.reshape(-1, order="A").view(np.uint8).data if size else memoryview(b""))
-        codes = array.reshape(1).view(np.dtype(np.uint32).newbyteorder(dtype.byteorder)) if dtype.kind == "U" else array
-        if dtype.kind == "U" and codes.max(initial=0) > sys.maxunicode:  # numpy would make an invalid text of it
-            raise ValueError(f"{member.filename[:80]!r}: expected a text, got codes that are no characters")
+        if dtype.kind == "U":
+            _check_text(member.filename, array)
         return array
+
+
+def _check_text(name: str, text: np.ndarray) -> None:
+    """Raise ValueError for codes that are no characters: numpy would make an invalid text of them."""
+    codes = text.reshape(1).view("<u4" if text.dtype.str[0] == "<" else ">u4")
+    if codes.max(initial=0) > sys.maxunicode:
+        raise ValueError(f"{name[:80]!r}: expected a text, got codes that are no characters")
 
 
 def _fill(content: IO[bytes], buffer: memoryview) -> None:
