@@ -125,10 +125,9 @@ def load(path: str | os.PathLike[str]) -> Result:
     Returns
     -------
     Result
-        The result of `rosafe.process` for the same samples, with the same bits and attributes. It also has the keys
-        `sample_rate` (Hz), `block_frames`, `parameters` (a dict of all of them, for `rosafe.process`), `source` (name
-        of the input), `channels` and `topic` if they were given, `clipped` (number of samples of a sound file that were
-        limited to full scale), `rosafe_version`, and `axes` and `units` of each output.
+        The result of `rosafe.process` for the same samples, with the same bits, keys and attributes. If
+        `rosafe process` has written it, it also has the keys `block_frames`, `source` (name of the input), `channels`
+        and `topic` if they were given, `pad` and `clip`.
 
     Raises
     ------
@@ -149,7 +148,7 @@ def load(path: str | os.PathLike[str]) -> Result:
         stored = [name for name in kind.outputs if name in result["axes"]]
         if stored and f"{kind.kind}_time" not in result:
             result[f"{kind.kind}_time"] = sample_times(result[stored[0]].shape[-1], result["sample_rate"])
-    if result.get("dtype") == "float32":
+    if result.pop("dtype", "") == "float32":
         result |= {name: result[name].astype(np.float32) for name in result["axes"]}
     return Result(
         result,

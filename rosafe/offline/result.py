@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import html
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -23,10 +24,13 @@ _MAX_VALUES = 8  # of a parameter that are shown
 class Result(dict[str, Any]):
     """The outputs and coordinates by name, as `rosafe.process` and `rosafe.load` return them.
 
+    The attributes are entries, too: `version` as `rosafe_version`, and of `axes` and `units` those of the outputs. `copy`
+    and `|` return a `Result`.
+
     Parameters
     ----------
     entries : mapping
-        Outputs and coordinates.
+        Outputs and coordinates; further options of the run, such as `block_frames`.
     parameters, sample_rate, version, clipped
         The attributes of these names.
 
@@ -57,10 +61,45 @@ class Result(dict[str, Any]):
         clipped: int = 0,
     ) -> None:
         super().__init__(entries)
-        self.parameters = dict(parameters)
-        self.sample_rate = float(sample_rate)  # files contain whole rates as integers
-        self.version = version
-        self.clipped = clipped
+        self["parameters"], self["sample_rate"] = dict(parameters), float(sample_rate)  # whole rates are int in files
+        self["rosafe_version"], self["clipped"] = version, clipped
+        self._describe_outputs()
+
+    def _describe_outputs(self) -> None:
+        axes, units = self.axes, self.units
+        self["axes"] = {**self.get("axes", {}), **axes}
+        self["units"] = {**self.get("units", {}), **{name: units[name] for name in axes}}
+
+    def copy(self) -> Result:
+        """Return a shallow copy."""
+        return copy.copy(self)
+
+    def __or__(self, other: Mapping[str, Any]) -> Result:  # type: ignore[override]
+        return self.copy().__ior__(other) if isinstance(other, Mapping) else NotImplemented
+
+    def __ror__(self, other: Mapping[str, Any]) -> Result:  # type: ignore[override]
+        return self | {name: value for name, value in other.items() if name not in self}
+
+    def __ior__(self, other: Any) -> Result:  # type: ignore[override, misc]
+        self.update(other)
+        self._describe_outputs()
+        return self
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        return cast(dict[str, Any], self["parameters"])
+
+    @property
+    def sample_rate(self) -> float:
+        return cast(float, self["sample_rate"])
+
+    @property
+    def version(self) -> str:
+        return cast(str, self["rosafe_version"])
+
+    @property
+    def clipped(self) -> int:
+        return cast(int, self["clipped"])
 
     @property
     def kinds(self) -> list[str]:

@@ -39,6 +39,7 @@ def assert_same(got: rosafe.Result, expected: rosafe.Result) -> None:
     )
     assert got.axes == expected.axes and got.clipped == expected.clipped
     assert {name: got.units[name] for name in expected.units} == expected.units
+    assert got.keys() - {"source", "block_frames", "pad", "clip"} == expected.keys()
     for name, value in expected.items():
         np.testing.assert_array_equal(got[name], value, err_msg=name)
 
@@ -73,8 +74,29 @@ def test_tables_and_text(result: rosafe.Result) -> None:
 
 
 def test_copies_keep_the_attributes(result: rosafe.Result) -> None:
-    for other in (copy.copy(result), pickle.loads(pickle.dumps(result))):
+    copies = (copy.copy(result), copy.deepcopy(result), pickle.loads(pickle.dumps(result)), result.copy())
+    for other in (*copies, result | {}, {} | result):
+        assert type(other) is rosafe.Result and other is not result
         assert_same(other, result)
+
+
+def test_union_describes_all_outputs(result: rosafe.Result) -> None:
+    itd = rosafe.process(SOUND, RATE, parameters=FEW, outputs="itd")
+    both = rosafe.process(SOUND, RATE, parameters=FEW, outputs=[*FRAMED, "gammatone", "itd"])
+    for union in (result | itd, itd | result, result.copy().__ior__(itd), dict(result) | itd):
+        assert_same(union, both)
+        assert union.axes.keys() == union["axes"].keys() == union["units"].keys()
+    assert "itd" not in result and "itd" not in result["axes"] and "ild" not in itd["axes"]
+    np.testing.assert_array_equal(({"ild": 0} | result)["ild"], result["ild"])
+    assert (result | {"ild": 0, "note": "x"})["note"] == "x"
+    with pytest.raises(TypeError):
+        result | 3  # type: ignore[operator]
+
+
+def test_attributes_are_entries(result: rosafe.Result) -> None:
+    assert result["parameters"] == result.parameters and result["sample_rate"] == RATE
+    assert result["rosafe_version"] == result.version and result["clipped"] == 0
+    assert result["axes"] == result.axes and result["units"]["ratemap"] == result.units["ratemap"]
 
 
 def test_loaded_attributes_have_the_declared_types(tmp_path: Path, result: rosafe.Result) -> None:
