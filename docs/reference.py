@@ -28,6 +28,7 @@ import rosafe
 from rosafe.declarations.parameter import format_value
 from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
+from rosafe.interface.citing import condition
 from rosafe.representations.registry import builtin_stages
 from rosafe.view.axes import style
 
@@ -91,8 +92,9 @@ def _parameters(declared: Representation) -> list[str]:
         return ["## Parameters\n\nIt has no parameters of its own.\n"]
     lines = ["## Parameters\n", "| name | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
     for one in declared.parameters:
-        default = format_value(one.default).replace("|", r"\|") or "empty"
-        lines.append(f"| `{one.name}` | `{default}` | {one.unit} | {one.range_text} | {one.doc} |")
+        value = format_value(one.default).replace("|", r"\|")
+        default = f"`{value}`" if value else "empty"
+        lines.append(f"| `{one.name}` | {default} | {one.unit} | {one.range_text} | {one.doc} |")
     return [*lines, ""]
 
 
@@ -103,13 +105,9 @@ def _references(declared: Representation) -> list[str]:
 
 
 def _condition(citation: Citation) -> str:
-    when = " and ".join(f"`{name}` {_choices(value)}" for name, value in citation.when)
-    about = "; with ".join(part for part in (citation.subject, when) if part)
-    return f" ({about})" if citation.subject else f" (with {when})" if when else ""
-
-
-def _choices(value: Any) -> str:
-    return " or ".join(map(format_value, value)) if isinstance(value, tuple) else format_value(value)
+    when = f"if {condition(citation)}" if citation.when else ""
+    about = "; ".join(part for part in (citation.subject, when) if part)
+    return f" ({about})" if about else ""
 
 
 def draw(kind: str, result: Any) -> None:

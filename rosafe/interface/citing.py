@@ -152,10 +152,11 @@ def _rows(kind: Representation) -> Iterator[str]:
         label = citation.reference.label
         doi = citation.reference.doi
         linked = f"[{label}](https://doi.org/{doi})" if doi else label
-        yield f"| `{kind.kind}` | {linked} | {citation.subject} | {_condition(citation)} |"
+        yield f"| `{kind.kind}` | {linked} | {citation.subject} | {condition(citation)} |"
 
 
-def _condition(citation: Citation) -> str:
+def condition(citation: Citation) -> str:
+    """Return the parameters with which a publication applies, as Markdown."""
     parts = []
     for name, value in citation.when:
         values = value if isinstance(value, tuple) else (value,)

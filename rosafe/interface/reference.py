@@ -91,7 +91,8 @@ def _service(component: ComponentSpec, service: Service, kinds: Mapping[str, Rep
 
 
 def _row(parameter: Parameter) -> tuple[str, ...]:
-    default = "required" if parameter.default is REQUIRED else f"`{_text(parameter.default)}`"
+    text = _text(parameter.default)
+    default = "required" if parameter.default is REQUIRED else f"`{text}`" if text else "empty"
     return f"`{parameter.name}`", _type(parameter.idl), default, parameter.range_text, parameter.doc
 
 

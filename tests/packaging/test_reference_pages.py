@@ -48,6 +48,13 @@ def test_a_page(kind: str, pages: ModuleType) -> None:
     assert not re.search(r"\\[,!;{}_]", page.split("## Equations")[1].split("## Parameters")[0])  # for GitHub
 
 
+@pytest.mark.parametrize("page", [*(f"reference/{kind}" for kind in KINDS), "parameters", "citing"])
+def test_no_word_of_a_generated_page_is_empty(page: str) -> None:
+    text = (ROOT / "docs" / f"{page}.md").read_text("utf-8")
+    prose = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    assert not re.findall(r".*(?:``|[^|\s] {2,}[^|\s]|\(\)|None).*", prose)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_picture(kind: str) -> None:
     data = (FOLDER / f"{kind}.png").read_bytes()
