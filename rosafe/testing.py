@@ -255,12 +255,26 @@ class _Trial:
                 raise
             except ValueError:
                 continue  # reported parameters need not be settable
-        one, other = (self.run(sound[:, half:], [half], stages) for stages in (copied, untouched))
+        independent = self._deep_copy(copied)
+        rest, lengths = sound[:, half:], [half // 2, 0, half]
+        one, other = (self.run(rest, lengths, stages) for stages in (copied, untouched))
         _assert_equal(one, other, "a change of a shallow copy alters the stage: build must create new objects")
+        if independent:
+            again = self.run(rest, lengths, independent)
+            _assert_equal(again, other, "a deep copy of the stage does not continue as the stage, or shares its state")
         for stage in copied:
             stage.reset()
         again, new = self.run(sound, [half], copied), self.run(sound, [half])
         _assert_equal(again, new, "after reset() the output differs from that of a new stage")
+
+
+    def _deep_copy(self, stages: list[Stage]) -> list[Stage]:
+        """Return deep copies of the stages; none if their state cannot be copied, such as an open file."""
+        with _trying("copy.deepcopy of the stage"):
+            try:
+                return copy.deepcopy(stages)
+            except TypeError:
+                return []
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from rosafe.declarations.parameter import REQUIRED, Parameter
 from rosafe.declarations.representation import Representation
 
 from . import buffer_pool, kernels
+from .copies import OwnState
 from .numeric_limits import FloatArray
 from .signal_format import SignalFormat
 
@@ -24,7 +25,7 @@ FLOAT64 = np.dtype(np.float64)
 Output = FloatArray | tuple[FloatArray, ...]  # a tuple if the representation has several parts
 
 
-class Stage:
+class Stage(OwnState):
     """The computation of a processor: it converts blocks to blocks and keeps its state between them.
 
     A representation is a subclass with a declaration. It implements `build`, `process` and `reset`. If the defaults do
@@ -34,6 +35,7 @@ class Stage:
     Rule: `build`, and therefore `configure` and `set_input_format`, replaces the objects that it changes (filters,
     framings, tables) and never modifies them. A shallow copy of a stage can therefore be configured while the original
     computes. The tree tries updates on such copies; it discards them, or uses them with the state of that moment.
+    Copies by `copy.deepcopy` and `pickle` are independent.
 
     Parameters
     ----------
@@ -82,6 +84,11 @@ class Stage:
         self.values = self._checked_values(parameters)
         self.build(self.values, frozenset(self.values))
         self._update_output_format()
+
+    def __copy__(self) -> Stage:
+        copied = object.__new__(type(self))
+        vars(copied).update(vars(self))
+        return copied
 
     @classmethod
     def effective_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:

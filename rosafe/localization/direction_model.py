@@ -53,6 +53,8 @@ MAX_LOG_RATIO = 100.0
 class DirectionModel:
     """Log-likelihood ratios of cues for directions, relative to the mean over all directions.
 
+    A model does not change; copies by `copy` are the model itself, which takes tens of megabytes.
+
     Attributes
     ----------
     azimuths : ndarray, (A,)
@@ -82,6 +84,12 @@ class DirectionModel:
         self._tables = kernels.EvidenceTables(
             self.itd_table, self.ild_table, ITD_BINS, ILD_BINS, LEVEL_CLASSES, LEVEL_STEP
         )
+
+    def __copy__(self) -> DirectionModel:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> DirectionModel:
+        return self
 
     @property
     def channels(self) -> int:

@@ -6,7 +6,6 @@ import hashlib
 import math
 import os
 from fractions import Fraction
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ from rosafe.terminal import printable
 _SYMMETRY = 1e-6  # of the energy; below, two ears count as mirrored
 _CUE_RATE = 48000.0  # Hz, at which the cues of the sphere are computed
 _MAX_ITD = 0.0012  # s
+_MAX_FILTERS = 4  # sample rates whose filters are kept
 
 
 class Head:
@@ -63,7 +63,10 @@ class Head:
         self.is_sphere = responses is None
         self._responses = responses
         self._rate = sample_rate
-        self._filters = lru_cache(maxsize=4)(self._make_filters)
+        self._filters: dict[float, HeadFilters] = {}  # by sample rate; replaced, not modified: threads may share it
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_filters": {}}  # filters are larger than the responses, and quickly made
 
     @classmethod
     def sphere(cls) -> Head:
@@ -116,7 +119,12 @@ class Head:
 
     def filters(self, sample_rate: float) -> HeadFilters:
         """Return the filters at a sample rate (Hz)."""
-        return self._filters(checked_rate(sample_rate))
+        rate = checked_rate(sample_rate)
+        filters = self._filters.get(rate)
+        if filters is None:
+            filters = self._make_filters(rate)
+            self._filters = dict([*self._filters.items(), (rate, filters)][-_MAX_FILTERS:])
+        return filters
 
     def _make_filters(self, sample_rate: float) -> HeadFilters:
         if self._responses is None:

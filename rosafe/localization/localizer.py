@@ -11,6 +11,7 @@ import numpy as np
 
 from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import short_repr
+from rosafe.dsp.copies import OwnState
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles, cues
 from rosafe.localization.direction_model import DirectionModel
@@ -31,8 +32,10 @@ UPDATE_SECONDS = 0.1  # between two updates of the tracks
 TRACK_SECONDS = 0.5  # of sound for an update
 
 
-class Localizer:
+class Localizer(OwnState):
     """Directions of sound that comes block by block, or as frames of representations.
+
+    Copies by `copy` and `pickle` are independent and continue with the same numbers.
 
     Parameters
     ----------

@@ -22,6 +22,7 @@ from rosafe.trust import foreign, user_cache
 
 VERSION = 3  # of the method; another one makes models on disk obsolete
 _models: weakref.WeakKeyDictionary[Head, dict[str, DirectionModel]] = weakref.WeakKeyDictionary()
+_by_key: weakref.WeakValueDictionary[str, DirectionModel] = weakref.WeakValueDictionary()  # for equal heads
 
 
 def folder() -> Path | None:
@@ -46,8 +47,10 @@ def model_of(
     if key not in known:
         cache = folder()
         path = cache / f"head-{key}.npz" if cache else None
-        known[key] = _from_disk(path, head, sample_rate, values) or _learn(
-            head, sample_rate, parameters, path, progress
+        known[key] = _by_key[key] = (
+            _by_key.get(key)
+            or _from_disk(path, head, sample_rate, values)
+            or _learn(head, sample_rate, parameters, path, progress)
         )
     return known[key]
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.fft
 
+from rosafe.dsp.copies import OwnState
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 from rosafe.localization.filters import HOP, HeadFilters, SourceRenderer
@@ -133,7 +134,7 @@ def truth_csv(truth: Callable[[float], Truth], seconds: float) -> str:
     return "\n".join(lines) + "\n"
 
 
-class SceneRenderer:
+class SceneRenderer(OwnState):
     """The samples of a scene, in order."""
 
     def __init__(self, scene: SceneDescription) -> None:

@@ -11,6 +11,7 @@ import scipy
 
 from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import short_repr
+from rosafe.dsp.copies import OwnState
 from rosafe.dsp.framing import FrameGrid
 from rosafe.dsp.gammatone_synthesis import (
     PAST_SECONDS,
@@ -291,7 +292,7 @@ def _preprocessing(values: Mapping[str, Any], sample_rate: float, size: int) -> 
     return np.asarray(scipy.fft.rfft(stage.process(impulse)[0]))
 
 
-class Resynthesizer:
+class Resynthesizer(OwnState):
     """The sound of gammatone channels that arrive block by block, with a constant delay.
 
     Parameters
@@ -325,7 +326,7 @@ class Resynthesizer:
     Notes
     -----
     Level scaling is compensated; other preprocessing is not. The output of a block depends on no later block, and only
-    by rounding on the length of blocks.
+    by rounding on the length of blocks. Copies by `copy` and `pickle` are independent and continue with the same numbers.
 
     Examples
     --------

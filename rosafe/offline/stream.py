@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.dsp.copies import OwnState
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import SAMPLE_RATE, Stage, parts_of
 from rosafe.interface import KINDS
@@ -23,12 +24,13 @@ from rosafe.tree import sizes
 _FINISH_FRAMES = 1024  # zeros that `finish` processes at a time
 
 
-class Stream:
+class Stream(OwnState):
     """Auditory representations of sound that arrives block by block.
 
     The numbers are those of `rosafe.process`, to the last bit, for any block lengths. Exception: gain control
     (`pp_bNormalizeRMS`) starts with a block. (Without kernels, and with plugins, the last digits depend on the blocks
-    too.) A stream must be used by one thread at a time, and starts none.
+    too.) A stream must be used by one thread at a time, and starts none. Copies by `copy` and `pickle` are independent and
+    continue with the same numbers.
 
     Parameters
     ----------

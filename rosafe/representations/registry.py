@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import importlib
 import pkgutil
 from collections.abc import Mapping
@@ -103,6 +104,18 @@ class _Search:
             self.problems.append(f"{origin}: {stage.REPRESENTATION.kind}: {problem}")
 
 
+def _new(kind: str) -> Stage:
+    return object.__new__(STAGES[kind])
+
+
+def _reduced(stage: Stage) -> tuple[Any, ...]:
+    """Return what `pickle` and `copy` need of a plugin's stage: its class was made by `checked`, and has no name."""
+    _, _, *state = stage.__reduce_ex__(2)
+    return _new, (stage.REPRESENTATION.kind,), *state
+
+
 _SEARCH = _Search()
 STAGES, PLUGINS, PROBLEMS, WARNINGS = _SEARCH.stages, _SEARCH.plugins, _SEARCH.problems, _SEARCH.warnings
+for _kind in PLUGINS:
+    copyreg.pickle(STAGES[_kind], _reduced)  # type: ignore[arg-type]
 BUILTIN = frozenset(builtin_stages())  # kinds that are not plugins

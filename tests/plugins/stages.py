@@ -183,8 +183,21 @@ FAULTS: Mapping[str, Fault] = {
     ),
     "cannot be copied": Fault(
         PLAIN,
-        "    def __reduce_ex__(self, version):\n        raise TypeError('no copies')",
+        "    def __copy__(self):\n        raise TypeError('no copies')",
         "no copies",
+        at_run_time=False,
+    ),
+    "state seen twice": Fault(
+        SAMPLES,
+        "    def __init__(self, *arguments, **parameters):\n"
+        "        super().__init__(*arguments, **parameters)\n        self.reset()\n"
+        "    def reset(self):\n        self.count = np.zeros(1)\n        self.view = self.count[:]\n"
+        + process(
+            "first = self.view[0]",
+            "self.count += block.shape[-1]",
+            "return block + 1e-6 * (first + np.arange(block.shape[-1]))",
+        ),
+        "a deep copy of the stage",
         at_run_time=False,
     ),
     "rows as a list": Fault(

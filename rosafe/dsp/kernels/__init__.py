@@ -148,6 +148,9 @@ class PinnedArray(NamedTuple):
         """Return `array`, which must not be resized, with its address."""
         return cls(array, _address(array))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return PinnedArray.of, (self.array,)  # the array of a copy has another address
+
 
 class SampleRange(NamedTuple):
     """Samples `start` to `stop` of each row of an array (*rows, T)."""
