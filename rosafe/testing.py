@@ -267,7 +267,6 @@ class _Trial:
         again, new = self.run(sound, [half], copied), self.run(sound, [half])
         _assert_equal(again, new, "after reset() the output differs from that of a new stage")
 
-
     def _deep_copy(self, stages: list[Stage]) -> list[Stage]:
         """Return deep copies of the stages; none if their state cannot be copied, such as an open file."""
         with _trying("copy.deepcopy of the stage"):

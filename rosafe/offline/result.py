@@ -24,8 +24,8 @@ _MAX_VALUES = 8  # of a parameter that are shown
 class Result(dict[str, Any]):
     """The outputs and coordinates by name, as `rosafe.process` and `rosafe.load` return them.
 
-    The attributes are entries, too: `version` as `rosafe_version`, and of `axes` and `units` those of the outputs. `copy`
-    and `|` return a `Result`.
+    The attributes are entries, too: `version` as `rosafe_version`, and `axes` and `units` for the outputs. `copy` and
+    `|` return a `Result`.
 
     Parameters
     ----------

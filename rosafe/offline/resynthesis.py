@@ -326,7 +326,8 @@ class Resynthesizer(OwnState):
     Notes
     -----
     Level scaling is compensated; other preprocessing is not. The output of a block depends on no later block, and only
-    by rounding on the length of blocks. Copies by `copy` and `pickle` are independent and continue with the same numbers.
+    by rounding on the length of blocks. Copies by `copy` and `pickle` are independent and continue with the same
+    numbers.
 
     Examples
     --------

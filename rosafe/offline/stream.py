@@ -29,8 +29,8 @@ class Stream(OwnState):
 
     The numbers are those of `rosafe.process`, to the last bit, for any block lengths. Exception: gain control
     (`pp_bNormalizeRMS`) starts with a block. (Without kernels, and with plugins, the last digits depend on the blocks
-    too.) A stream must be used by one thread at a time, and starts none. Copies by `copy` and `pickle` are independent and
-    continue with the same numbers.
+    too.) A stream must be used by one thread at a time, and starts none. Copies by `copy` and `pickle` are independent
+    and continue with the same numbers.
 
     Parameters
     ----------

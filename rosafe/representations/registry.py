@@ -110,12 +110,11 @@ def _new(kind: str) -> Stage:
 
 def _reduced(stage: Stage) -> tuple[Any, ...]:
     """Return what `pickle` and `copy` need of a plugin's stage: its class was made by `checked`, and has no name."""
-    _, _, *state = stage.__reduce_ex__(2)
-    return _new, (stage.REPRESENTATION.kind,), *state
+    return _new, (stage.REPRESENTATION.kind,), *tuple(stage.__reduce_ex__(2))[2:]
 
 
 _SEARCH = _Search()
 STAGES, PLUGINS, PROBLEMS, WARNINGS = _SEARCH.stages, _SEARCH.plugins, _SEARCH.problems, _SEARCH.warnings
 for _kind in PLUGINS:
-    copyreg.pickle(STAGES[_kind], _reduced)  # type: ignore[arg-type]
+    copyreg.pickle(STAGES[_kind], _reduced)
 BUILTIN = frozenset(builtin_stages())  # kinds that are not plugins
