@@ -347,6 +347,20 @@ MUTATIONS = (
         "tests/dsp/test_blocks.py tests/dsp/test_changes.py tests/dsp/test_kernels.py -k 'not aarch64 and not nehalem'",
     ),
     _dsp(
+        "copy-with-arrays-of-others",
+        "copies.py",
+        "vars(self).update(copy.deepcopy(state))",
+        "vars(self).update(state)",
+        "tests/offline/test_copies.py -k 'independently and band'",
+    ),
+    _dsp(
+        "copy-with-the-address-of-the-original",
+        "kernels/__init__.py",
+        "return PinnedArray.of, (self.array,)",
+        "return PinnedArray, (self.array, self.address)",
+        "tests/offline/test_copies.py -k 'independently and deepcopy'",
+    ),
+    _dsp(
         "stage-change-not-atomic",
         "stage.py",
         "        tried = copy.copy(self)\n",
@@ -559,6 +573,13 @@ MUTATIONS = (
         "(model.head, model.sample_rate, model.parameters) == (head.key, sample_rate, values)",
         "(model.sample_rate, model.parameters) == (sample_rate, values)",
         "tests/localization/test_files.py -k damaged_entry",
+    ),
+    _localization(
+        "model-learned-again-for-a-copy-of-a-head",
+        "model_cache.py",
+        "            _by_key.get(key)\n",
+        "            None\n",
+        "tests/offline/test_copies.py -k share_its_models",
     ),
     _localization(
         "tracker-never-forgets",

@@ -109,7 +109,7 @@ def _new(kind: str) -> Stage:
 
 
 def _reduced(stage: Stage) -> tuple[Any, ...]:
-    """Return what `pickle` and `copy` need of a plugin's stage: its class was made by `checked`, and has no name."""
+    """Return the kind and the state of a plugin's stage, for `pickle`: its class, made by `checked`, has no name."""
     return _new, (stage.REPRESENTATION.kind,), *tuple(stage.__reduce_ex__(2))[2:]
 
 
