@@ -6,7 +6,7 @@ import copy
 import html
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,14 +18,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from xarray import Dataset
 
+# attributes by the names of the same values in files
+_ATTRIBUTES = {
+    **{name: name for name in ("parameters", "sample_rate", "clipped", "axes", "units")},
+    "rosafe_version": "version",
+}
 _MAX_VALUES = 8  # of a parameter that are shown
 
 
 class Result(dict[str, Any]):
     """The outputs and coordinates by name, as `rosafe.process` and `rosafe.load` return them.
 
-    The attributes are entries, too: `version` as `rosafe_version`, and `axes` and `units` for the outputs. `copy` and
-    `|` return a `Result`.
+    The attributes can also be read as entries (`result["parameters"]`, and `version` as `rosafe_version`), but
+    iteration omits them. `copy` and `|` return a `Result`, with the attributes of the left one.
 
     Parameters
     ----------
@@ -60,46 +65,39 @@ class Result(dict[str, Any]):
         version: str,
         clipped: int = 0,
     ) -> None:
-        super().__init__(entries)
-        self["parameters"], self["sample_rate"] = dict(parameters), float(sample_rate)  # whole rates are int in files
-        self["rosafe_version"], self["clipped"] = version, clipped
-        self._describe_outputs()
+        super().__init__({name: value for name, value in entries.items() if name not in _ATTRIBUTES})
+        self.parameters = dict(parameters)
+        self.sample_rate = float(sample_rate)  # files contain whole rates as integers
+        self.version = version
+        self.clipped = clipped
 
-    def _describe_outputs(self) -> None:
-        axes, units = self.axes, self.units
-        self["axes"] = {**self.get("axes", {}), **axes}
-        self["units"] = {**self.get("units", {}), **{name: units[name] for name in axes}}
+    def __missing__(self, name: str) -> Any:
+        if name in _ATTRIBUTES:
+            return getattr(self, _ATTRIBUTES[name])
+        raise KeyError(name)
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or name in _ATTRIBUTES
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return an entry or an attribute by name."""
+        try:
+            return self[name]
+        except KeyError:
+            return default
 
     def copy(self) -> Result:
         """Return a shallow copy."""
         return copy.copy(self)
 
-    def __or__(self, other: Mapping[str, Any]) -> Result:  # type: ignore[override]
+    def __or__(self, other: Any) -> Result:  # type: ignore[override]
         return self.copy().__ior__(other) if isinstance(other, Mapping) else NotImplemented
 
-    def __ror__(self, other: Mapping[str, Any]) -> Result:  # type: ignore[override]
-        return self | {name: value for name, value in other.items() if name not in self}
-
-    def __ior__(self, other: Any) -> Result:  # type: ignore[override, misc]
-        self.update(other)
-        self._describe_outputs()
-        return self
-
-    @property
-    def parameters(self) -> dict[str, Any]:
-        return cast(dict[str, Any], self["parameters"])
-
-    @property
-    def sample_rate(self) -> float:
-        return cast(float, self["sample_rate"])
-
-    @property
-    def version(self) -> str:
-        return cast(str, self["rosafe_version"])
-
-    @property
-    def clipped(self) -> int:
-        return cast(int, self["clipped"])
+    def __ror__(self, other: Any) -> Result:  # type: ignore[override]
+        merged = self.copy()
+        merged.clear()
+        merged.update(other)
+        return merged.__ior__(self)
 
     @property
     def kinds(self) -> list[str]:

@@ -76,9 +76,6 @@ def to_xarray(result: Mapping[str, Any], sample_rate: float | None = None) -> Da
 def _attributes(result: Mapping[str, Any]) -> dict[str, Any]:
     """Return the attributes of the dataset."""
     attributes = {name: result[name] for name in ("sample_rate", "rosafe_version", "source") if name in result}
-    for name, attribute in (("sample_rate", "sample_rate"), ("rosafe_version", "version")):
-        if hasattr(result, attribute):  # the result object, not a plain dict
-            attributes[name] = getattr(result, attribute)
     parameters = getattr(result, "parameters", None)
     if parameters is not None:
         attributes["parameters"] = json.dumps(parameters)

@@ -16,7 +16,7 @@ from rosafe.interface import CORE_REPRESENTATIONS, KINDS
 from tests.cli.command import SMALL, SMALL_PARAMETERS, as_int32, noise, rosafe, write
 from tests.harness import shared
 
-BESIDES = {"clipped", "sample_rate", "block_frames", "parameters", "source", "rosafe_version", "axes", "units"}
+BESIDES = {"block_frames", "source"}
 FRAMES = ["ild", "ratemap", "crossCorrelation"]
 SEVEN = ("--outputs", ",".join(CORE_REPRESENTATIONS))
 
