@@ -10,6 +10,7 @@ import inspect
 import os
 import pkgutil
 import sys
+import warnings
 from pathlib import Path
 
 from rosafe import commands, missing, streams
@@ -44,7 +45,9 @@ def main(argv: list[str] | None = None) -> int:
             rest = [word for word in rest if word.startswith("-")]
         if rest:
             options.usage_error(f"unrecognized arguments: {' '.join(rest)}")
-        return int(options.run(options))
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda text, *_, **__: print(f"{name}: {printable(text)}", file=sys.stderr)
+            return int(options.run(options))
     except (CommandError, OutputError, GenerationError, MasterError) as problem:
         print(f"{name}: {printable(problem)}", file=sys.stderr)
         return 1

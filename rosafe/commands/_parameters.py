@@ -41,6 +41,23 @@ def add_settings(parser: argparse.ArgumentParser, where: str) -> None:
     parser.set_defaults(more_inputs=[])
 
 
+def add_mirror(parser: argparse.ArgumentParser) -> None:
+    """Add --mirror and --no-mirror for the head."""
+    parser.add_argument(
+        "--mirror",
+        action=argparse.BooleanOptionalAction,
+        help="whether the labels of the SOFA file are corrected: ears exchanged if it has the right ear first, "
+        "otherwise azimuths negated (default: if the ear that faces the source is clearly the quieter one)",
+    )
+
+
+def head_of(path: str | None, mirror: bool | None) -> Any:
+    """Return the head for `--head` with `--mirror`: a Head for a SOFA file, otherwise the name (sphere if None)."""
+    from rosafe.localization.head import Head
+
+    return Head.from_sofa(path, mirror) if path and path.lower().endswith(".sofa") else path or "sphere"
+
+
 def ear_channels(text: str) -> tuple[int, int]:
     """Convert the value of --channels, such as ``3,4``."""
     from rosafe.sound.audiofile import channel_pair

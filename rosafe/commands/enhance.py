@@ -13,15 +13,15 @@ from typing import Any
 
 from rosafe import option_types
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_settings, ear_channels, parameters_of
+from rosafe.commands._parameters import add_mirror, add_settings, ear_channels, head_of, parameters_of
 from rosafe.output import check_target, write_files
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
-        "rosafe enhance SOUND --azimuth DEG [--head FILE] -o OUT.wav [--channels L,R]\n"
-        "                      [--set NAME=VALUE ...] [--force]"
+        "rosafe enhance SOUND --azimuth DEG [--head FILE] [--[no-]mirror] -o OUT.wav\n"
+        "                      [--channels L,R] [--set NAME=VALUE ...] [--force]"
     )
     parser.add_argument("inputs", nargs="*", metavar="SOUND", help="sound file or rosbag with two ears")
     parser.add_argument(
@@ -37,6 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default="sphere",
         help="SOFA file, or a model that `rosafe head learn` has written (default: a sphere)",
     )
+    add_mirror(parser)
     parser.add_argument("-o", "--to", dest="to", metavar="OUT.wav", required=True, help="the enhanced sound")
     parser.add_argument(
         "--channels",
@@ -69,7 +70,9 @@ def run(options: argparse.Namespace) -> int:
 
     try:
         sound, rate = read_ears(inputs[0], options.channels)
-        enhanced = enhance(sound, rate, options.azimuth, options.head, parameters_of(options.settings) or None)
+        enhanced = enhance(
+            sound, rate, options.azimuth, head_of(options.head, options.mirror), parameters_of(options.settings) or None
+        )
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
     _write(target, enhanced, rate, options.force)

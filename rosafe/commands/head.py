@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rosafe import option_types
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_settings, parameters_of
+from rosafe.commands._parameters import add_mirror, add_settings, parameters_of
 from rosafe.output import check_target
 
 _RATE = 44100
@@ -20,10 +20,14 @@ _RATE = 44100
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.usage = "rosafe head learn HEAD.sofa|RECORDINGS.csv -o FILE [--rate HZ] [--set NAME=VALUE ...] [--force]"
+    parser.usage = (
+        "rosafe head learn HEAD.sofa|RECORDINGS.csv -o FILE [--rate HZ] [--[no-]mirror]\n"
+        "                  [--set NAME=VALUE ...] [--force]"
+    )
     parser.add_argument("action", type=_action, metavar="learn", help="what to do")
     parser.add_argument("inputs", nargs="*", metavar="SOURCE", help="SOFA file, or CSV file with a list of recordings")
     parser.add_argument("-o", "--to", dest="to", metavar="FILE", required=True, help="the model")
+    add_mirror(parser)
     parser.add_argument(
         "--rate",
         type=option_types.whole_number(8000, 768_000),
@@ -64,7 +68,9 @@ def run(options: argparse.Namespace) -> int:
         if inputs[0].lower().endswith(".csv"):
             model = learn_recordings(inputs[0], options.rate, parameters, progress)
         else:
-            model = learn_head(Head.from_sofa(inputs[0]), float(options.rate or _RATE), parameters, progress)
+            model = learn_head(
+                Head.from_sofa(inputs[0], options.mirror), float(options.rate or _RATE), parameters, progress
+            )
         if progress:
             progress(1.0)
         model.save(target, options.force)

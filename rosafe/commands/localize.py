@@ -6,8 +6,8 @@ OUT.tracks.csv, OUT.json, or OUT.png, a picture of the posterior and the sources
 
 Without SOUND it is the ROS node localizer: it requests the representations that it needs from a running rosAFE, and
 publishes the tracked sources on /localizer/sources, /localizer/poses (for rviz) and /localizer/posterior at 10 Hz,
-until Ctrl-C. The options of the node are also private ROS parameters: ~head, ~seconds, ~world_frame, ~head_frame,
-~rosafe, ~connect, ~audio_delay, ~noise. With --check or --calibrate-noise it measures and ends.
+until Ctrl-C. The options of the node are also private ROS parameters: ~head, ~mirror, ~seconds, ~world_frame,
+~head_frame, ~rosafe, ~connect, ~audio_delay, ~noise. With --check or --calibrate-noise it measures and ends.
 docs/directions.md describes it."""
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ import argparse
 import functools
 import importlib
 import sys
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rosafe import option_types
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_settings, ear_channels, parameters_of
+from rosafe.commands._parameters import add_mirror, add_settings, ear_channels, head_of, parameters_of
 from rosafe.missing import require
 from rosafe.output import OutputError, check_target, write_files
 from rosafe.terminal import printable
@@ -35,10 +34,11 @@ _TRACKS = ".tracks.csv"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
-        "rosafe localize SOUND [--head FILE] [--seconds S] [--yaw FILE.csv] [-o OUT.csv|.json|.png]\n"
-        "                       [--channels L,R] [--set NAME=VALUE ...] [--force]\n"
-        "       rosafe localize [--head FILE] [--seconds S] [--world-frame NAME] [--head-frame NAME] [--rosafe NAME]\n"
-        "                       [--connect TOPIC] [--set NAME=VALUE ...] [--name NAME] [-b] [--wait] [NAME:=VALUE ...]"
+        "rosafe localize SOUND [--head FILE] [--[no-]mirror] [--seconds S] [--yaw FILE.csv]\n"
+        "                       [-o OUT.csv|.json|.png] [--channels L,R] [--set NAME=VALUE ...] [--force]\n"
+        "       rosafe localize [--head FILE] [--[no-]mirror] [--seconds S] [--world-frame NAME] [--head-frame NAME]\n"
+        "                       [--rosafe NAME] [--connect TOPIC] [--set NAME=VALUE ...] [--name NAME]\n"
+        "                       [-b] [--wait] [NAME:=VALUE ...]"
     )
     parser.add_argument("inputs", nargs="*", metavar="SOUND", help="sound file or rosbag with two ears")
     parser.add_argument(
@@ -47,6 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="SOFA file, or a model that `rosafe head learn` has written (default: a sphere, which cannot distinguish "
         "front from back)",
     )
+    add_mirror(parser)
     parser.add_argument(
         "--seconds",
         type=option_types.seconds(0.01, 60.0),
@@ -142,21 +143,16 @@ def _localize(path: str, options: argparse.Namespace) -> int:
     try:
         yaw: Any = read_yaw(options.yaw) if options.yaw else 0.0
         sound, rate = read_ears(path, options.channels)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", UserWarning)
-            result = localize(
-                sound,
-                rate,
-                options.head or "sphere",
-                options.seconds or 0.5,
-                parameters_of(options.settings) or None,
-                head_yaw=yaw,
-            )
+        result = localize(
+            sound,
+            rate,
+            head_of(options.head, options.mirror),
+            options.seconds or 0.5,
+            parameters_of(options.settings) or None,
+            head_yaw=yaw,
+        )
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
-    for warning in caught:
-        if issubclass(warning.category, UserWarning):
-            print(f"rosafe localize: {printable(warning.message)}", file=sys.stderr)
     if not files:
         sys.stdout.write(estimates_csv(result))
     title = printable(Path(path).name)

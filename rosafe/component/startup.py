@@ -13,6 +13,7 @@ import stat
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -321,10 +322,11 @@ def ensure_log_directory() -> None:
 def log_to_stderr() -> None:
     """Redirect rospy's information lines to stderr, where its warnings are: stdout is for the output of requests.
 
-    Text that they quote from clients and files is escaped.
+    Text that they quote from clients and files is escaped. Warnings of the library become log lines.
     """
     import logging
 
+    import rospy
     from rosgraph.roslogging import RosStreamHandler
 
     class Handler(RosStreamHandler):
@@ -332,6 +334,7 @@ def log_to_stderr() -> None:
             text = printable(record.getMessage(), keep="\n")
             super().emit(logging.makeLogRecord({**vars(record), "msg": text, "args": ()}))
 
+    warnings.showwarning = lambda text, *_, **__: rospy.logwarn(str(text))
     rosout = logging.getLogger("rosout")
     for handler in rosout.handlers[:]:
         if isinstance(handler, RosStreamHandler):

@@ -42,11 +42,16 @@ class Head:
         Impulse responses of the left and the right ear; None for the sphere, whose responses are computed.
     sample_rate : float
         Of the responses, Hz.
+    front_only : bool
+        Whether the directions cover the front half only.
 
     Attributes
     ----------
     is_sphere : bool
-        Whether front and back have equal interaural cues in all directions.
+        Whether front and back have equal interaural cues, so that azimuths are in the front half: the sphere, and a
+        head that was measured in the front half only.
+    front_only : bool
+        Whether it was measured in the front half only.
 
     Examples
     --------
@@ -57,10 +62,18 @@ class Head:
     ((2, 8000), True)
     """
 
-    def __init__(self, name: str, azimuths: FloatArray, responses: FloatArray | None, sample_rate: float) -> None:
+    def __init__(
+        self,
+        name: str,
+        azimuths: FloatArray,
+        responses: FloatArray | None,
+        sample_rate: float,
+        front_only: bool = False,
+    ) -> None:
         self.name = name
         self.azimuths = azimuths
-        self.is_sphere = responses is None
+        self.is_sphere = responses is None or front_only
+        self.front_only = front_only
         self._responses = responses
         self._rate = sample_rate
         self._filters: dict[float, HeadFilters] = {}  # by sample rate; replaced, not modified: threads may share it
@@ -77,22 +90,29 @@ class Head:
         return cls("sphere", angles.grid(), None, _CUE_RATE)
 
     @classmethod
-    def from_sofa(cls, path: str | os.PathLike[str]) -> Head:
+    def from_sofa(cls, path: str | os.PathLike[str], mirror: bool | None = None) -> Head:
         """Read a head from a SOFA file with the convention SimpleFreeFieldHRIR (AES69).
+
+        Ears and azimuths are checked: of a source at a side, the nearer ear is the louder one at 4 to 8 kHz. If the
+        labels of the file say the opposite, it is read corrected, with a warning. Another warning names the number of
+        directions that could not be used.
 
         Parameters
         ----------
         path : str or Path
-            The file. Directions within 1 degree of the horizontal plane are used; they must surround the head with
-            gaps of at most 30 degrees.
+            The file. Measurements within 2.5 degrees of the horizontal plane of the head are used, in each direction
+            the nearest. They must surround the head, or cover its front half, with gaps of at most 30 degrees.
+        mirror : bool, optional
+            Whether the labels are corrected without a check: the ears are exchanged if the file has the right ear
+            first, otherwise the azimuths are negated.
 
         Raises
         ------
         ValueError
             The file is missing, damaged, no SOFA file or unsuitable: one line that names it.
         """
-        read = read_sofa(path)
-        return cls(os.fspath(path), read.azimuths, read.responses, read.sample_rate)
+        read = read_sofa(path, mirror)
+        return cls(os.fspath(path), read.azimuths, read.responses, read.sample_rate, read.front_only)
 
     def __repr__(self) -> str:
         return f"<Head {self.name}: {len(self.azimuths)} directions>"
@@ -141,7 +161,19 @@ class Head:
             responses = scipy.signal.resample_poly(responses, ratio.numerator, ratio.denominator, axis=-1) / float(
                 ratio
             )
-        return HeadFilters(self.azimuths, responses)
+        azimuths = self.azimuths
+        if self.front_only:  # the back is the mirrored front, as the sphere has it; `render` refuses it
+            azimuths = np.concatenate((azimuths, angles.wrap(180.0 - azimuths)))
+            azimuths, rows = np.unique(np.round(azimuths, 6), return_index=True)
+            responses = responses[rows % len(responses)]
+        return HeadFilters(azimuths, responses)
+
+    def _check_covered(self, azimuths: FloatArray) -> None:
+        if self.front_only and not (np.abs(angles.wrap(azimuths)) <= 90.0).all():
+            raise ValueError(
+                f"azimuth: expected -90 to 90 degrees, which {printable(self.name)} covers, got a direction behind the "
+                "head; use a head that was measured all around"
+            )
 
     def render(self, signal: Any, sample_rate: float, azimuth: Any) -> FloatArray:
         """Render a signal at a direction.
@@ -164,7 +196,8 @@ class Head:
         Raises
         ------
         ValueError
-            For a signal that is not one-dimensional and finite, or an azimuth of another shape.
+            For a signal that is not one-dimensional and finite, an azimuth of another shape, or one that the head does
+            not cover.
         """
         samples = np.asarray(signal)
         if samples.ndim != 1 or samples.dtype.kind not in "iuf":
@@ -174,6 +207,7 @@ class Head:
             raise ValueError(f"signal: expected finite samples up to {LIMIT:g}, got larger ones, NaN or infinity")
         filters = self.filters(sample_rate)
         directions = _checked_azimuth(azimuth, samples.shape)
+        self._check_covered(directions)
         if not len(samples):
             return np.empty((2, 0))
         if directions.ndim == 0:
@@ -220,6 +254,7 @@ class Head:
         directions = np.atleast_1d(
             self.azimuths if azimuths is None else _checked_azimuth(azimuths, np.shape(azimuths))
         )
+        self._check_covered(directions)
         filters = self.filters(rate)
         at = filters.at(angles.wrap(directions))
         bins = np.fft.rfftfreq(filters.size, 1 / rate)

@@ -129,7 +129,10 @@ class _SceneReader:
         path = self._path(node, what)
         if not path.lower().endswith(".sofa"):
             raise SetupError(node.line, f"{what}: expected 'sphere' or a file that ends in .sofa")
-        return Head.from_sofa(path)
+        head = Head.from_sofa(path)
+        if head.front_only:
+            raise SetupError(node.line, f"{what}: expected a head measured all around, got the front half only")
+        return head
 
     def _sources(self, nodes: tuple[YamlNode, ...]) -> tuple[SourceDescription, ...]:
         sources: dict[str, SourceDescription] = {}

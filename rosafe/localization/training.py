@@ -56,7 +56,7 @@ def learn_head(
     if symmetric:
         directions = directions[directions >= 0]
     if head.is_sphere:
-        directions = directions[directions <= 90]
+        directions = directions[np.abs(directions) <= 90]
     random = np.random.default_rng(1)
     noises = _noise_pool(lambda azimuth: filters.response(azimuth), sample_rate, random)
     seconds = SOUND_SECONDS / (len(directions) * len(SNR_DB))

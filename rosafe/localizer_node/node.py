@@ -140,7 +140,7 @@ class Models:
         self._head: Any = SPHERE
         path = os.path.expanduser(settings.head)
         if path.lower().endswith(".sofa"):
-            self._head = Head.from_sofa(path)
+            self._head = Head.from_sofa(path, settings.mirror)
         elif settings.head != "sphere":
             self._head = DirectionModel.load(path)
 

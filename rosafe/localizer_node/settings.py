@@ -25,6 +25,8 @@ class LocalizerSettings:
     ----------
     head : str
         `sphere`, or the path of a SOFA file or of a learned model.
+    mirror : bool or None
+        Whether the labels of the SOFA file are corrected; None: by a check, as in `Head.from_sofa`.
     seconds : float
         Length of the window of integration.
     world_frame : str
@@ -44,6 +46,7 @@ class LocalizerSettings:
     """
 
     head: str = "sphere"
+    mirror: bool | None = None
     seconds: float = 0.5
     world_frame: str = ""
     head_frame: str = "head"
@@ -84,6 +87,10 @@ def read_settings(options: Mapping[str, Any], node: str = "~") -> LocalizerSetti
 
 def _check(name: str, value: Any) -> Any:
     if name == "parameters":
+        return value
+    if name == "mirror":
+        if not isinstance(value, bool):
+            raise ValueError(f"mirror: expected true or false, got {short_repr(value)}")
         return value
     if name in ("seconds", "audio_delay"):
         low, high = (0.01, MAX_SECONDS) if name == "seconds" else (-MAX_AUDIO_DELAY, MAX_AUDIO_DELAY)

@@ -156,7 +156,7 @@ def _set(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
         (_set("Data.SamplingRate", np.array([10.0])), "sample rate"),
         (_set("SourcePosition", lambda p: p + np.array([0, 45, 0])), "horizontal plane"),
         (_set("SourcePosition", lambda p: p * np.array([0.4, 1, 1])), "a gap of"),
-        (_set("SourcePosition", lambda p: p[:5]), "36 rows in SourcePosition"),
+        (_set("SourcePosition", lambda p: p[:5]), "1 or 36 rows of 3 coordinates in SourcePosition"),
         (_set("ReceiverPosition", np.zeros((2, 3, 1))), "one receiver on the left"),
         (_set("Data.Delay", np.array([[0.0, 1e9]])), "delays of at most"),
         (_set("SourcePosition", {}), "SourcePosition: expected an array"),
