@@ -43,7 +43,6 @@ classdef client < handle
             if nargin < 2 || ~ischar(component) || isempty(component)
                 error('genomix:load', 'load: expected the name of a component, for example ''rosAFE''');
             end
-            [~, name] = fileparts(component); % the original also accepts paths of plug-ins
             query = {};
             varargin = cellfun(@genomix.wire.chars, varargin, 'UniformOutput', false);
             if numel(varargin) == 2 && strcmp(varargin{1}, '-i') && ischar(varargin{2})
@@ -51,7 +50,7 @@ classdef client < handle
             elseif ~isempty(varargin)
                 error('genomix:load', 'load: expected ''-i'', ''instance'' after the name of a component');
             end
-            [about, failed] = obj.get(['/load/' genomix.wire.quote(name)], query, false);
+            [about, failed] = obj.get(['/load/' genomix.wire.quote(component)], query, false);
             if failed
                 error('genomix:load', 'load %s: %s', component, genomix.request.explain(about));
             elseif ~isstruct(about) || ~all(isfield(about, {'name', 'instance', 'services', 'ports'})) || ...

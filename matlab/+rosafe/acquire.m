@@ -7,7 +7,7 @@ chunks = max(1, floor(bufferSize_s_bass * sampleRate / nFramesPerChunk));
 request = bass.Acquire('-a', inputDevice, sampleRate, nFramesPerChunk, chunks);
 check(request);
 about = describe(bass);
-check(rosAFE.connect_port('Audio', [about.instance '/Audio']));
+check(rosAFE.connect_port('Audio', [about.node '/Audio']));
 end
 
 function check(request)

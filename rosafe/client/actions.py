@@ -64,7 +64,7 @@ class ActionClient:
     def __init__(self, graph: Graph, package: str, instance: str, action: str) -> None:
         self._graph = graph
         self._instance = instance
-        self._name = f"/{instance}/{action}"
+        self._name = f"{graph.resolve(instance)}/{action}"
         self._loop = asyncio.get_running_loop()
         self.goals: dict[str, Goal] = {}  # in progress, by id
         self._subscribers: list[Any] = []

@@ -137,11 +137,15 @@ class Call:
 
 
 class ComponentClient:
-    """A client of the node `instance`, whose interface is `component`. Several sessions may share one."""
+    """A client of the node `instance`, whose interface is `component`. Several sessions may share one.
+
+    `instance` is relative to the namespace of this process, unless it begins with a slash; `node` is the full name.
+    """
 
     def __init__(self, graph: Graph, component: ComponentSpec, instance: str) -> None:
         self.component = component
         self.instance = instance
+        self.node = graph.resolve(instance)
         self.graph = graph
         self._services: dict[str, ServiceClient] = {}
         self._actions: dict[str, asyncio.Task[ActionClient]] = {}
@@ -157,7 +161,8 @@ class ComponentClient:
         package = await _package(graph, instance)
         component = await asyncio.to_thread(installed_components.known, package)
         if package not in COMPONENTS:
-            component = installed_components.with_ports(component, instance, await graph.published_by(instance))
+            topics = await graph.published_by(instance)
+            component = installed_components.with_ports(component, graph.resolve(instance), topics)
         with contextlib.suppress(NotRegisteredError, ComponentError):
             await graph.node_uri(instance)  # caches the address for its ports, in case the master stops answering
         return cls(graph, component, instance)
@@ -169,12 +174,12 @@ class ComponentClient:
 
     def describe(self, name: str) -> dict[str, Any]:
         """Return the description of the component for a client that has loaded it under `name`."""
-        return describe_component(self.component, self.instance, name)
+        return describe_component(self.component, self.instance, self.node, name)
 
     async def check(self, name: str) -> None:
         """Raise ComponentError if the component no longer runs, or if `name` is neither its name nor its instance's."""
-        if name not in (self.component.name, self.instance):
-            raise cannot_load(f"/{self.instance}: expected the component {name}, got {self.component.name}")
+        if name not in (self.component.name, self.node.rpartition("/")[2]):
+            raise cannot_load(f"{self.node}: expected the component {name}, got {self.component.name}")
         with self._count_pending():
             await self._client("connect_port").check()
 
@@ -276,7 +281,7 @@ class ComponentClient:
         kind = ros_type(self.component.port(port).idl)
         _, subscribed, _ = await self.graph.master("getSystemState")
         types = dict(await self.graph.master("getTopicTypes"))
-        topics = [topic for topic, nodes in subscribed if f"/{self.instance}" in nodes]
+        topics = [topic for topic, nodes in subscribed if self.node in nodes]
         return next((topic for topic in topics if types.get(topic, "").split("/")[-1] == kind), "")
 
     async def published(self, topic: str) -> bool:
@@ -286,7 +291,7 @@ class ComponentClient:
     @contextlib.asynccontextmanager
     async def other(self, instance: str) -> AsyncIterator[ComponentClient]:
         """Yield a client of another component; ComponentError if there is none of that name."""
-        client = await ComponentClient.load(self.graph, instance)
+        client = await ComponentClient.load(self.graph, self.graph.shorten(instance))
         try:
             yield client
         finally:
@@ -372,7 +377,7 @@ class ComponentClient:
         raise _no_port(f"{missing}; there are: {elements}")
 
     async def _read(self, port: PortSpec, element: str) -> Any:
-        topic = f"/{self.instance}/{port.name}"
+        topic = f"{self.node}/{port.name}"
         if port.idl not in self._readers:
             kind = installed_components.message_class(self.component.name, port.idl)
             self._readers[port.idl] = TopicReader(self.graph, self.instance, kind)
@@ -388,16 +393,18 @@ class ComponentClient:
             raise _no_port(f"{self.instance} does not publish {topic}: {problem}") from None
 
 
-def names(component: str, instance: str) -> tuple[str, str]:
+async def names(graph: Graph, component: str, instance: str) -> tuple[str, str]:
     """Return the names of a component and its instance from the arguments of `load`.
 
     Parameters
     ----------
+    graph : Graph
+        Its namespace is that of relative names, and of the component if there is no instance.
     component : str
-        Name of the component or instance, or the path of a GenoM plugin (``/opt/lib/rosAFE.so``), whose file name
-        counts.
+        Name of the component or instance, or the path of a GenoM plugin (``/opt/lib/rosAFE.so``, also without the
+        suffix), whose file name counts.
     instance : str
-        Name of the node; empty: that of the component.
+        Name of the node, such as ``robot1/rosAFE``; empty: that of the component.
 
     Raises
     ------
@@ -405,16 +412,24 @@ def names(component: str, instance: str) -> tuple[str, str]:
         ``::genomix::e_load`` if one of them is not a valid name.
     """
     name = component.rstrip("/").rsplit("/", 1)[-1].removesuffix(".so")
-    instance = instance.strip("/") or name
-    for word in (name, instance):
-        if not rosgraph.names.is_legal_base_name(word):
-            raise cannot_load(f"expected the name of a component or instance, got {word[:80]!r}")
-    return name, instance
+    instance = instance.rstrip("/")
+    if not instance and _is_node_name(component):  # otherwise a relative path, or an absolute one as scripts have it
+        is_node = not component.startswith("/") or await graph.is_service(f"{component.rstrip('/')}/connect_port")
+        instance = component.rstrip("/") if is_node else ""
+    instance = instance or name
+    if not (rosgraph.names.is_legal_base_name(name) and _is_node_name(instance)):
+        wrong = name if _is_node_name(instance) else instance
+        raise cannot_load(f"expected the name of a component or instance, such as robot1/rosAFE, got {wrong[:80]!r}")
+    return name, graph.shorten(instance)
+
+
+def _is_node_name(name: str) -> bool:
+    return bool(name) and name.isascii() and not name.startswith("~") and rosgraph.names.is_legal_name(name)
 
 
 async def _package(graph: Graph, instance: str) -> str:
     """Return the ROS package of the component that runs as `instance`, as the component reports it."""
-    name = f"/{instance}/connect_port"
+    name = f"{graph.resolve(instance)}/connect_port"
     probe = {"service": name, "md5sum": "*", "probe": "1", "callerid": graph.name}
     deadline = asyncio.get_running_loop().time() + APPEAR_SECONDS
     pause = POLL_SECONDS

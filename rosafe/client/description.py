@@ -8,12 +8,13 @@ from rosafe.interface import KINDS, REQUIRED, ROSAFE, ComponentSpec, Parameter, 
 from rosafe.interface.rosafe import WHOLE_TREES
 
 
-def describe_component(component: ComponentSpec, instance: str, name: str) -> dict[str, Any]:
-    """Return the description of `instance` of a component that a client has loaded under `name`."""
+def describe_component(component: ComponentSpec, instance: str, node: str, name: str) -> dict[str, Any]:
+    """Return the description of an `instance` of a component, the node of that full name, loaded under `name`."""
     return {
         "name": name,
         "component": component.name,
         "instance": instance,
+        "node": node,
         "doc": component.doc,
         "services": {
             **{s.name: _describe_service(s, composite=False) for s in component.services},

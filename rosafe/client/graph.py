@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 from xml.parsers.expat import ExpatError
 
 import aiohttp
+import rosgraph.names
 
 from rosafe.client.asyncio_tools import run_shared
 from rosafe.client.errors import middleware_error
@@ -54,6 +55,7 @@ class Graph:
 
     def __init__(self, uri: str, program: str = "genomixd", server: bool = False) -> None:
         self.uri = uri
+        self._namespace = rosgraph.names.get_ros_namespace()  # ROS_NAMESPACE or __ns, with a slash at its end
         self._program = program
         self._server = server
         self.name = f"/{program}_{os.getpid()}_{int(time.time() * 1000)}"
@@ -81,6 +83,16 @@ class Graph:
 
             await asyncio.to_thread(rospy.signal_shutdown, f"{self._program} ends")
         await self._http.close()
+
+    # --- names ---
+
+    def resolve(self, name: str) -> str:
+        """Return the full name of a node; a relative name is in the namespace of this process."""
+        return str(rosgraph.names.ns_join(self._namespace, name))
+
+    def shorten(self, name: str) -> str:
+        """Return the shortest name that `resolve` maps to the full name of `name`."""
+        return self.resolve(name).removeprefix(self._namespace)
 
     # --- XML-RPC ---
 
@@ -145,7 +157,7 @@ class Graph:
         """Return all topics that the node `instance` publishes, with their types."""
         publishers, _, _ = await self.master("getSystemState")
         types = dict(await self.master("getTopicTypes"))
-        return {topic: types.get(topic, "") for topic, nodes in publishers if f"/{instance}" in nodes}
+        return {topic: types.get(topic, "") for topic, nodes in publishers if self.resolve(instance) in nodes}
 
     async def topic_address(self, topic: str, instance: str) -> tuple[str, int]:
         """Return host and port at which the node `instance` publishes `topic`, or raise NotRegisteredError.
@@ -169,7 +181,7 @@ class Graph:
 
     async def node_uri(self, instance: str) -> str:
         """Return and cache the XML-RPC address of the node `instance`, or raise NotRegisteredError."""
-        uri = str(await self.master("lookupNode", f"/{instance}"))
+        uri = str(await self.master("lookupNode", self.resolve(instance)))
         _remember(self._uris, instance, uri)
         return uri
 
@@ -212,7 +224,7 @@ class Graph:
 
         loop = asyncio.get_running_loop()
         start = functools.partial(
-            registration.init_node, self._program, startup.names_given(), not self._server, self._server
+            registration.init_node, self._program, startup.remappings_given(), not self._server, self._server
         )
         try:
             (await asyncio.to_thread(start)).up()

@@ -76,23 +76,23 @@ def describe(package: str) -> ComponentSpec:
     )
 
 
-def with_ports(component: ComponentSpec, instance: str, topics: Mapping[str, str]) -> ComponentSpec:
-    """Return `component` with the output ports that `instance` publishes.
+def with_ports(component: ComponentSpec, node: str, topics: Mapping[str, str]) -> ComponentSpec:
+    """Return `component` with the output ports that `node` publishes.
 
     Parameters
     ----------
     topics : mapping
-        The published topics of the instance, with their types.
+        The published topics of the node, with their types.
     """
     messages = _module(component.name, "msg")
     structs = dict(component.structs)
     ports = {port.name: port for port in component.ports}
     for topic, kind in sorted(topics.items()):
         package, _, message = kind.partition("/")
-        name, _, element = topic.removeprefix(f"/{instance}/").partition("/")
+        name, _, element = topic.removeprefix(f"{node}/").partition("/")
         generated = getattr(messages, message, None) if package == component.name else None
         is_message = isinstance(generated, type) and issubclass(generated, genpy.Message)  # any node may register it
-        if not (topic.startswith(f"/{instance}/") and is_message) or message.endswith(_ACTION_PARTS):
+        if not (topic.startswith(f"{node}/") and is_message) or message.endswith(_ACTION_PARTS):
             continue
         ports.setdefault(name, PortSpec(name, _struct(generated, structs), "", multiple=bool(element)))
     return dataclasses.replace(component, ports=tuple(ports.values()), structs=structs)

@@ -9,16 +9,16 @@ from typing import Any
 from rosafe.client.graph import Graph, NotRegisteredError
 from rosafe.setups import LOCALIZER
 
-NODE = "localizer"
+NODE = "localizer"  # in the namespace of its rosAFE
 
 
-async def set_parameters(graph: Graph, settings: Mapping[str, Any]) -> None:
-    """Set the private parameters of the node, which reads them when it starts; delete those that are not given.
+async def set_parameters(graph: Graph, node: str, settings: Mapping[str, Any]) -> None:
+    """Set the private parameters of the `node`, which reads them when it starts; delete those that are not given.
 
     Raises ComponentError without a master.
     """
     for parameter in LOCALIZER:
-        name = f"/{NODE}/{parameter.name}"
+        name = f"{node}/{parameter.name}"
         if parameter.name in settings:
             await graph.master("setParam", name, settings[parameter.name])
         else:
@@ -26,6 +26,6 @@ async def set_parameters(graph: Graph, settings: Mapping[str, Any]) -> None:
                 await graph.master("deleteParam", name)
 
 
-async def is_registered(graph: Graph) -> bool:
-    """Return whether a localizer is registered at the master."""
-    return f"/{NODE}/sources" in await graph.published_by(NODE)
+async def is_registered(graph: Graph, node: str) -> bool:
+    """Return whether the localizer `node` is registered at the master."""
+    return f"{node}/sources" in await graph.published_by(node)

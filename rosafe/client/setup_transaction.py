@@ -9,6 +9,7 @@ from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
 from rosafe.client.errors import middleware_error
+from rosafe.declarations import ros_names
 from rosafe.declarations.plugins import FOLDERS
 from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError
 from rosafe.setups import AcquireSettings, Setup, SetupError, dry_run, plan, read, setup_processor, write
@@ -56,7 +57,7 @@ async def capture(component: ComponentProtocol) -> Setup:
         async with _bass(component, topic) as bass:
             if bass is not None and (now := await bass.outputs("getAcquisition", {}))["running"]:
                 sound = AcquireSettings.of(now)
-    return Setup(sound, {AUDIO: topic} if topic else {}, tuple(processors))
+    return Setup(sound, {AUDIO: ros_names.relative(topic, component.node)} if topic else {}, tuple(processors))
 
 
 async def load(component: ComponentProtocol, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -114,8 +115,10 @@ async def _undo(component: ComponentProtocol, created: list[str], undo_steps: li
 
 async def _topic(component: ComponentProtocol, setup: Setup) -> str:
     """Return the topic for the Audio port; empty if the setup has none and the default topic is not published."""
-    topic = setup.connections.get(AUDIO, "") or await component.port_connected(AUDIO)
-    default = f"/{REQUEST.parameter('connect').default}"
+    if AUDIO in setup.connections:
+        return ros_names.resolve(setup.connections[AUDIO], component.node)
+    topic = await component.port_connected(AUDIO)
+    default = ros_names.resolve(REQUEST.parameter("connect").default, component.node)
     return topic or (default if setup.sound is not None or await component.published(default) else "")
 
 
@@ -128,13 +131,13 @@ async def _wait_for_topic(component: ComponentProtocol, topic: str, seconds: flo
 @contextlib.asynccontextmanager
 async def _bass(component: ComponentProtocol, topic: str) -> AsyncIterator[Services | None]:
     """Yield the bass component that publishes `topic`; None if another node publishes it."""
-    instance, _, port = topic.removeprefix("/").rpartition("/")
-    if not instance or "/" in instance or port != AUDIO:
+    node, _, port = topic.rpartition("/")
+    if not node or port != AUDIO:
         yield None
         return
     async with contextlib.AsyncExitStack() as stack:
         try:
-            bass = await stack.enter_async_context(component.other(instance))
+            bass = await stack.enter_async_context(component.other(node))
         except ComponentError:
             bass = None
         yield bass if bass is not None and getattr(bass, "component", BASS) is BASS else None

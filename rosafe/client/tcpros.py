@@ -162,7 +162,7 @@ class ServiceClient:
     def __init__(self, graph: Graph, package: str, instance: str, service: str) -> None:
         self._graph = graph
         self._instance = instance
-        self.name = f"/{instance}/{service}"
+        self.name = f"{graph.resolve(instance)}/{service}"
         definition = getattr(importlib.import_module(f"{package}.srv"), service)
         self._request_class = getattr(importlib.import_module(f"{package}.srv"), f"{service}Request")
         self._response_class = installed_components.response_class(package, service)
@@ -196,7 +196,7 @@ class ServiceClient:
         try:
             return await connect_service(self._graph, self._instance, self._header)
         except NotRegisteredError:
-            if self._plugin and await self._graph.is_service(f"/{self._instance}/connect_port"):
+            if self._plugin and await self._graph.is_service(f"{self._graph.resolve(self._instance)}/connect_port"):
                 raise self._without_plugin() from None
             raise not_running(self._instance, self.name) from None
         except ConnectionRejected as problem:

@@ -16,7 +16,7 @@ from pathlib import Path
 from rosafe import commands, missing, streams
 from rosafe.commands import CommandError
 from rosafe.component.generate import GenerationError
-from rosafe.component.startup import Parser, without_names
+from rosafe.component.startup import Parser, without_names, without_remappings
 from rosafe.declarations import plugins
 from rosafe.output import OutputError
 from rosafe.terminal import printable
@@ -25,6 +25,7 @@ from rosafe.version import VERSION
 
 # compute nothing or built-in representations only, or import plugins in a child process
 _WITHOUT_PLUGINS = ("check", "doctor", "record", "trace", "validate")
+_LAUNCHED = ("live", "localize", "record", "setup")  # by roslaunch; others have arguments NAME=VALUE
 _ONE_BLAS_THREAD = ("localize",)  # multiplies small matrices: more threads take several times the processor time
 _EPILOG = """example:
   rosafe process speech.wav -o speech.npz --outputs ild,ratemap --set fb_nChannels=64
@@ -36,6 +37,7 @@ def main(argv: list[str] | None = None) -> int:
     name = "rosafe"
     try:
         words = without_names(sys.argv[1:] if argv is None else argv)
+        words = without_remappings(words) if words[:1] and words[0] in _LAUNCHED else words
         options, rest = _parser(words).parse_known_args(words)
         name = f"rosafe {options.command}"
         if hasattr(options, "missing"):

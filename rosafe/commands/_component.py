@@ -70,7 +70,7 @@ async def _find(graph: Graph, instance: str, wait: float) -> ComponentClient:
     deadline = time.monotonic() + wait
     while True:
         try:
-            client = await ComponentClient.load(graph, names(ROSAFE.name, instance)[1])
+            client = await ComponentClient.load(graph, (await names(graph, ROSAFE.name, instance))[1])
             await client.check(ROSAFE.name)
             return client
         except ComponentError as problem:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import aiohttp
+from rosgraph.names import get_ros_namespace
 
 from rosafe.commands import CommandError
 from rosafe.demo.processes import Child, ProcessGroup
@@ -115,11 +116,14 @@ class Launcher:
     async def start_genomixd(self, port: int) -> None:
         """Use the running genomixd on `port` or start one."""
         url = f"http://127.0.0.1:{port}"
-        if await _is_genomixd(url):
-            self.processes["genomixd"] = ManagedProcess("genomixd", "runs", f"{url}, was there")
+        if other := await _genomixd(url):
+            process = self.processes["genomixd"] = ManagedProcess("genomixd", "runs", f"{url}, was there")
+            if (namespace := _namespace(other)) != _namespace(f"Namespace: {get_ros_namespace(self.env)}"):
+                process.state = "refused"
+                process.detail = f"{url} is a genomixd of the namespace {namespace}; choose another one with --port"
             return
         process = self.start("genomixd", paths.program("genomixd"), "-p", str(port))
-        await self._until(process, lambda: _is_genomixd(url))
+        await self._until(process, lambda: _genomixd(url))
         if process.state == "runs":
             process.detail = url
 
@@ -127,12 +131,13 @@ class Launcher:
         """Use the running localizer or start one with these settings."""
         from rosafe.client import localizer
 
-        if self.processes["roscore"].child is None and await localizer.is_registered(graph):
+        node = graph.resolve(localizer.NODE)
+        if self.processes["roscore"].child is None and await localizer.is_registered(graph, node):
             self.processes["localizer"] = ManagedProcess("localizer", "runs", "was there")
             return
-        await localizer.set_parameters(graph, settings)
+        await localizer.set_parameters(graph, node, settings)
         process = self.start("localizer", paths.program("rosafe"), "localize")
-        await self._until(process, lambda: localizer.is_registered(graph))
+        await self._until(process, lambda: localizer.is_registered(graph, node))
         if process.state == "runs":
             process.detail = f"head: {settings.get('head', 'sphere')}"
 
@@ -148,7 +153,7 @@ class Launcher:
         if process.child is not None and (url := _URL.search(process.child.out)):
             process.detail = url[0]
 
-    async def _until(self, process: ManagedProcess, condition: Callable[[], Awaitable[bool]]) -> None:
+    async def _until(self, process: ManagedProcess, condition: Callable[[], Awaitable[object]]) -> None:
         deadline = asyncio.get_running_loop().time() + START_SECONDS
         while True:
             process.poll()
@@ -187,13 +192,20 @@ async def _client(graph: Graph, name: str) -> ComponentClient | None:
     return client
 
 
-async def _is_genomixd(url: str) -> bool:
+async def _genomixd(url: str) -> str:
+    """Return the beginning of the help of the genomixd at `url`; empty if there is none."""
     timeout = aiohttp.ClientTimeout(total=2)
     try:
         async with aiohttp.ClientSession(timeout=timeout) as http, http.get(f"{url}/") as answer:
-            return (await answer.content.read(100)).startswith(b"genomixd")
+            text = (await answer.content.read(300)).decode("utf-8", "replace")
+            return text if text.startswith("genomixd") else ""
     except (aiohttp.ClientError, OSError):
-        return False
+        return ""
+
+
+def _namespace(text: str) -> str:
+    found = re.search(r"^Namespace: (/\S*)", text, re.MULTILINE)
+    return (found[1] if found else "").rstrip("/") or "/"
 
 
 def environment() -> dict[str, str]:

@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-i", "--instance", default="rosAFE", metavar="NAME", help="name of the rosAFE node (default: rosAFE)"
     )
-    parser.add_argument("--bass", default="bass", metavar="NAME", help="name of the bass node (default: bass)")
+    parser.add_argument("--bass", metavar="NAME", help="name of the bass node (default: bass beside the rosAFE node)")
     parser.epilog = (
         "examples:\n"
         "  rosafe live\n"
@@ -47,12 +47,10 @@ def run(options: argparse.Namespace) -> int:
 
     prepare()
     startup.ensure_log_directory()
-    from rosafe.client.component_client import names  # needs the messages
     from rosafe.http_server.listener import ListenError
     from rosafe.live import daemon
 
     try:
-        options.instance, options.bass = (names(name, name)[1] for name in (options.instance, options.bass))
         asyncio.run(daemon.serve(options))
     except (ComponentError, ListenError) as problem:
         raise CommandError(str(problem)) from None

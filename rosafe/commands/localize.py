@@ -5,7 +5,7 @@ azimuth_deg, confidence, level_db) on the standard output, or the files that -o 
 OUT.tracks.csv, OUT.json, or OUT.png, a picture of the posterior and the sources over time.
 
 Without SOUND it is the ROS node localizer: it requests the representations that it needs from a running rosAFE, and
-publishes the tracked sources on /localizer/sources, /localizer/poses (for rviz) and /localizer/posterior at 10 Hz,
+publishes the tracked sources on localizer/sources, localizer/poses (for rviz) and localizer/posterior at 10 Hz,
 until Ctrl-C. The options of the node are also private ROS parameters: ~head, ~mirror, ~seconds, ~world_frame,
 ~head_frame, ~rosafe, ~connect, ~audio_delay, ~noise. With --check or --calibrate-noise it measures and ends.
 docs/directions.md describes it."""
@@ -126,7 +126,7 @@ def _add_node(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Localize and write the results."""
-    inputs = [name for name in (*options.inputs, *options.more_inputs) if ":=" not in name]
+    inputs = [*options.inputs, *options.more_inputs]
     if len(inputs) > 1:
         options.usage_error(f"SOUND: expected one file, got {len(inputs)}")
     return _localize(inputs[0], options) if inputs else _run_node(options)
@@ -175,7 +175,7 @@ def _run_node(options: argparse.Namespace) -> int:
         raise CommandError(str(problem)) from None
     if options.check or options.calibrate_noise is not None:
         return _measure(given, options)
-    remappings = [*startup.names_given()[1:], *(name for name in options.inputs if ":=" in name)]
+    remappings = startup.remappings_given()[1:]
 
     def build(instance: str) -> startup.RosNode:
         from rosafe.localizer_node.node import LocalizerNode  # needs the messages
@@ -191,6 +191,8 @@ def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
     from rosafe.component.startup import become_node
 
     become_node("rosafe_localize")
+    import rospy
+
     from rosafe.localizer_node import ear_check, noise_calibration, noise_measurement
     from rosafe.localizer_node.frame_listener import FrameListener, NoFramesError
     from rosafe.localizer_node.settings import read_settings
@@ -199,7 +201,7 @@ def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
         print(text, flush=True)
 
     try:
-        settings = read_settings(given, f"/{options.instance}/")
+        settings = read_settings(given, f"{rospy.resolve_name(options.instance)}/")
         with FrameListener(settings) as listener:
             if options.check:
                 report = ear_check.check_ears(listener, say)

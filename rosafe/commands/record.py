@@ -1,6 +1,6 @@
 """Record sound to a WAV file or a rosbag with a level meter; without an output, show the meter only.
 
-The sound comes from a running bass (topic /bass/Audio) or, without ROS, from a --device: a sound card, file:PATH,
+The sound comes from a running bass (topic bass/Audio) or, without ROS, from a --device: a sound card, file:PATH,
 bag:PATH or scene:, named as for Acquire of bass. OUT.wav contains the exact samples with 32 bits; above 4 GiB it is an
 RF64 file, which libsndfile reads like any WAV. OUT.bag is for `rosbag play` and the device bag:. Lost frames are
 replaced by silence and reported. Ctrl-C ends the recording with a complete file."""
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rosafe.bass.recording.recorder import SoundRecorder
     from rosafe.bass.sources import SoundSource
 
-_TOPIC = "/bass/Audio"
+_TOPIC = "bass/Audio"
 _EARS = ("left", "right")
 _RATE = 44100  # of a device that does not define a rate
 _MIN_SECONDS, _MAX_SECONDS = 1e-6, 1e7
@@ -320,7 +320,7 @@ def _open_output(part: AtomicOutput, options: argparse.Namespace, source: SoundS
         return WavFile(descriptor, source.sample_rate)
     # A published stream keeps its frame numbers and its name.
     chunk, newest = getattr(source, "frames_per_chunk", options.chunk), getattr(source, "newest", 0)
-    return BagWriter(descriptor, source.sample_rate, chunk, source.name if options.topic else _TOPIC, newest)
+    return BagWriter(descriptor, source.sample_rate, chunk, f"/{_TOPIC}" if options.device or options.socket else source.name, newest)
 
 
 def _summary(recorder: SoundRecorder, name: str, sample_rate: int) -> str:

@@ -17,6 +17,7 @@ from typing import Any
 
 from rosafe.commands import CommandError
 from rosafe.commands._component import component, format_error, prepare
+from rosafe.declarations import ros_names
 from rosafe.declarations.text import did_you_mean, short_repr
 from rosafe.interface import REQUEST, ROSAFE, ComponentError, Representation
 from rosafe.interface.arguments import check_parameter
@@ -79,11 +80,11 @@ def run(options: argparse.Namespace) -> int:
     if options.connect is not None:
         values["connect"] = options.connect
     prepare()
-    answer = asyncio.run(_send(options.instance, values, kind))
+    node, answer = asyncio.run(_send(options.instance, values, kind))
     if options.json:
         print(json.dumps(answer, indent=2))
     else:
-        _show(answer, kind)
+        _show(node, answer, kind)
     return 0
 
 
@@ -103,17 +104,17 @@ def _parameter(setting: str) -> tuple[str, Any]:
     return check_parameter(name, text, text=True)
 
 
-async def _send(instance: str, values: Mapping[str, Any], kind: Representation) -> Mapping[str, Any]:
-    """Return the response as genomixd would. Raises CommandError, with the next step, if the request is refused."""
+async def _send(instance: str, values: Mapping[str, Any], kind: Representation) -> tuple[str, Mapping[str, Any]]:
+    """Return the full name of the node, and the response as genomixd would. Raises CommandError, with the next step, if the request is refused."""
     async with component(instance) as client:
         try:
             existing = (await client.outputs("getProcessors", {}))["processors"]
             _warn(kind, values, new_input=all(processor["upperDepName"] for processor in existing))
-            return await client.outputs(REQUEST.name, values)
+            return client.node, await client.outputs(REQUEST.name, values)
         except ComponentError as problem:
             if problem.ex != "::rosAFE::e_noData":
                 raise CommandError(format_error(problem)) from None
-            topic = "/" + str(values.get("connect", REQUEST.parameter("connect").default)).lstrip("/")
+            topic = ros_names.resolve(str(values.get("connect", REQUEST.parameter("connect").default)), client.node)
             start = "" if await client.published(topic) else "bass-ros -b; "
             acquire = f"rosservice call {topic.rpartition('/')[0]}/Acquire \"{{device: 'scene:'}}\""
             silent = f"{problem.ex}: {ROSAFE.exceptions['e_noData']}"
@@ -128,10 +129,9 @@ def _warn(kind: Representation, values: Mapping[str, Any], new_input: bool) -> N
         print(f"rosafe request: {name} has no effect{reason}", file=sys.stderr, flush=True)
 
 
-def _show(answer: Mapping[str, Any], kind: Representation) -> None:
+def _show(node: str, answer: Mapping[str, Any], kind: Representation) -> None:
     """Print a line for each processor."""
     width = max(map(len, answer["dependencies"]))
-    instance = answer["topic"].split("/")[1]
     for name, ancestor in zip(answer["dependencies"], request.ancestor_kinds(kind), strict=True):
         state = "created" if name in answer["created"] else "reused"
-        print(printable(f"{state:7}  {name:{width}}  {request.topic(instance, ancestor, name)}"))
+        print(printable(f"{state:7}  {name:{width}}  {request.topic(node, ancestor, name)}"))

@@ -18,6 +18,7 @@ from typing import Any
 from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._component import component, format_error, prepare
+from rosafe.declarations import ros_names
 from rosafe.input import read_regular
 from rosafe.interface import MAX_SETUP, ROSAFE, ComponentError
 from rosafe.output import write_whole
@@ -122,10 +123,11 @@ async def load(setup: Setup, instance: str, wait: float = 0.0) -> dict[str, Any]
 
     async with component(instance, wait) as client:
         try:
+            node = ros_names.resolve(localizer.NODE, client.node)
             answer = {**await setup_transaction.apply(client, setup, wait), "localizer": ""}
             if setup.localizer is not None:
-                await localizer.set_parameters(client.graph, setup.localizer)
-                answer["localizer"] = "running" if await localizer.is_registered(client.graph) else "set"
+                await localizer.set_parameters(client.graph, node, setup.localizer)
+                answer["localizer"] = "running" if await localizer.is_registered(client.graph, node) else "set"
             return answer
         except ComponentError as problem:
             raise CommandError(format_error(problem)) from None
@@ -136,7 +138,7 @@ async def _captured(options: argparse.Namespace) -> str:
 
     async with component(options.instance, options.wait) as client:
         try:
-            if await localizer.is_registered(client.graph):
+            if await localizer.is_registered(client.graph, ros_names.resolve(localizer.NODE, client.node)):
                 print("the localizer is not saved; add a section localizer (docs/setups.md)", file=sys.stderr)
             return write(await setup_transaction.capture(client), options.full)
         except ComponentError as problem:

@@ -130,7 +130,9 @@ def run_node(
         print(f"{program}: {printable(problem)}", file=sys.stderr)
         watchdog(END_SECONDS, 1)
         return 1
-    ready = f"{program}: ready as /{options.instance} at {os.environ['ROS_MASTER_URI']}"
+    import rospy
+
+    ready = f"{program}: ready as {rospy.get_name()} at {os.environ['ROS_MASTER_URI']}"
     with contextlib.suppress(OSError):  # the reader of stderr has ended
         print(printable(ready), file=sys.stderr, flush=True)
     if fork is not None:
@@ -206,7 +208,8 @@ def _start(
     mappings = dict(remapping.split(":=", 1) for remapping in remappings)
     if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", options.instance):
         raise _Failure(
-            f"instance name: expected letters, digits and _, beginning with a letter, got {options.instance!r}"
+            f"instance name: expected letters, digits and _, beginning with a letter, got {options.instance!r}; "
+            "__ns:=robot1 sets the namespace"
         )
     for name, variable in _ENVIRONMENT_REMAPPINGS.items():
         if mappings.get(name):
@@ -274,6 +277,7 @@ def _await_master(uri: str, received: list[int], patient: str) -> None:
 
 
 _NAME = re.compile(r"__\w+:=")
+_REMAPPING = re.compile(r"(__|[~/]?[A-Za-z])[\w/]*:=")
 
 
 def without_names(arguments: list[str]) -> list[str]:
@@ -281,9 +285,14 @@ def without_names(arguments: list[str]) -> list[str]:
     return [word for word in arguments if not _NAME.match(word)]
 
 
-def names_given() -> list[str]:
-    """Return the program of this process and the arguments that `without_names` removes."""
-    return [sys.argv[0], *(word for word in sys.argv[1:] if _NAME.match(word))]
+def without_remappings(arguments: list[str]) -> list[str]:
+    """Return the command line without the arguments that roslaunch adds for nodes and for each ``<remap>``."""
+    return [word for word in arguments if not _REMAPPING.match(word)]
+
+
+def remappings_given() -> list[str]:
+    """Return the program of this process and the arguments that `without_remappings` removes."""
+    return [sys.argv[0], *(word for word in sys.argv[1:] if _REMAPPING.match(word))]
 
 
 def become_node(name: str) -> None:
@@ -305,7 +314,7 @@ def become_node(name: str) -> None:
     generate.ensure_messages()
     ensure_log_directory()
     try:
-        registration.init_node(name, names_given(), anonymous=True).up()
+        registration.init_node(name, remappings_given(), anonymous=True).up()
     except (rospy.ROSException, ValueError) as problem:
         raise master.MasterError(f"cannot become a node: {problem}") from None
     log_to_stderr()

@@ -29,7 +29,7 @@ THREADS = 16  # for blocking calls of rospy
 
 def main(argv: list[str] | None = None) -> int:
     """Run genomixd until a signal ends it; return the exit code."""
-    options = _parse(startup.without_names(sys.argv[1:] if argv is None else argv))
+    options = _parse(startup.without_remappings(sys.argv[1:] if argv is None else argv))
     _log_to_stderr(2 if options.debug else min(options.verbose, 2))
     fork = startup.DaemonFork() if options.background else None
     if fork is not None and fork.in_parent:

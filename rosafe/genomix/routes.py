@@ -65,6 +65,7 @@ _COMPONENT_ERROR = 422  # the component has rejected the request
 _SESSION_NAME = re.compile(r"[\w.:@-]{1,100}")
 _PACKED = "packed"  # the only binary syntax
 _HELP = """genomixd {version}: HTTP access (GET) to the components of the ROS graph.
+Namespace: {namespace}
 Answers are JSON; with syntax=tcl they are Tcl dicts, with syntax=packed binary data for MATLAB and Octave.
 /session/start?s=NAME  /session/stop?s=NAME  /session/listen?s=NAME (server-sent events: request, unload, quit)
 /load/COMPONENT[?i=INSTANCE][&as=NAME]  /unload/NAME  /describe/NAME  /components  /rpath?dir=DIR
@@ -186,7 +187,7 @@ class HttpApi:
     # --- sessions ---
 
     async def _help(self, request: web.Request) -> web.Response:
-        return _text(_HELP.format(version=VERSION))
+        return _text(_HELP.format(version=VERSION, namespace=self._sessions.graph.resolve("")))
 
     async def _session_start(self, request: web.Request) -> web.Response:
         if not request.query.get("s"):

@@ -124,7 +124,7 @@ class Session:
     async def load(self, component: str, instance: str, name: str) -> dict[str, Any]:
         """Load a component, under `name` unless that is empty, and return its description."""
         client = await self._sessions.component_client(component, instance)
-        name = name or client.instance
+        name = name or client.instance.strip("/").replace("/", "_")
         if name not in self.components and len(self.components) >= MAX_COMPONENTS:
             await self.unload(next(iter(self.components)))  # its next call loads it again
         self.components[name] = client
@@ -140,8 +140,9 @@ class Session:
         await self._sessions.release()
 
     async def component(self, name: str, instance: str) -> ComponentClient:
-        """Return the component loaded under `name`; load `instance`, or the one of that name, if there is none."""
-        if name not in self.components:
+        """Return the component loaded under `name`; load `instance`, or the one of that name, if it is another one."""
+        loaded = self.components.get(name)
+        if loaded is None or (instance and self._sessions.graph.resolve(instance.rstrip("/")) != loaded.node):
             await self.load(instance or name, instance, name)
         self.components[name] = client = self.components.pop(name)  # the most recently used one is last
         return client
@@ -346,7 +347,7 @@ class Sessions:
 
     async def component_client(self, component: str, instance: str) -> ComponentClient:
         """Return the client of a running component, which all sessions share."""
-        name, instance = names(component, instance)
+        name, instance = await names(self.graph, component, instance)
         client = self._clients.get(instance)
         if client is None:
             loaded = await ComponentClient.load(self.graph, instance)

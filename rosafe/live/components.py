@@ -28,14 +28,14 @@ class ComponentFacade:
     Parameters
     ----------
     graph : Graph
-    instance, bass : str
-        Names of the two nodes.
+    rosafe, bass : str
+        Full names of the two nodes.
     """
 
-    def __init__(self, graph: Graph, instance: str, bass: str) -> None:
+    def __init__(self, graph: Graph, rosafe: str, bass: str) -> None:
         self._graph = graph
-        self._rosafe = ComponentClient(graph, ROSAFE, instance)
-        self._bass = ComponentClient(graph, BASS, bass)
+        self._rosafe = ComponentClient(graph, ROSAFE, graph.shorten(rosafe))
+        self._bass = ComponentClient(graph, BASS, graph.shorten(bass))
 
     async def close(self) -> None:
         """Close all connections."""

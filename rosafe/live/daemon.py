@@ -14,9 +14,13 @@ from argparse import Namespace
 from pathlib import Path
 
 from rosafe.client.asyncio_tools import set_up_server, wait_any
+from rosafe.client.component_client import names
 from rosafe.client.graph import Graph
+from rosafe.client.localizer import NODE
 from rosafe.component import startup
+from rosafe.declarations import ros_names
 from rosafe.http_server.access import own_names
+from rosafe.interface import BASS, ROSAFE
 from rosafe.live.access import TokenAuth
 from rosafe.live.components import ComponentFacade
 from rosafe.live.health import Health
@@ -44,16 +48,21 @@ async def _serve(options: Namespace, cleanup: contextlib.AsyncExitStack) -> None
     end = set_up_server(THREADS)
     graph = Graph(os.environ["ROS_MASTER_URI"], "rosafe_live", server=True)
     cleanup.push_async_callback(graph.close)
-    components = ComponentFacade(graph, options.instance, options.bass)
+    _, instance = await names(graph, ROSAFE.name, options.instance)
+    afe = graph.resolve(instance)
+    _, instance = await names(graph, BASS.name, options.bass or ros_names.resolve(BASS.name, afe))
+    bass = graph.resolve(instance)
+    localizer = ros_names.resolve(NODE, afe)
+    components = ComponentFacade(graph, afe, bass)
     cleanup.push_async_callback(components.close)
 
     def on_new_columns() -> None:
         if not loop.is_closed():
             loop.call_soon_threadsafe(server.on_new_columns)
 
-    hub = Hub(options.bass, on_new_columns)
+    hub = Hub(bass, localizer, on_new_columns)
     auth = TokenAuth(own_names() | {options.host})
-    server = WebServer(components, hub, Health(options.instance, options.bass), auth, options.watch)
+    server = WebServer(components, hub, Health(afe, bass, localizer), auth, options.watch)
     cleanup.push_async_callback(server.close)
     port = await server.start(options.host, options.port)
     await graph.become_node()  # after the server listens, because this ends another page of the same name

@@ -40,19 +40,23 @@ class DirectionTopics:
         Returns the audio of bass, whose stamps relate clock and audio, or None.
     append : callable
         Called with number, column (SIZE, n) and end (s of the audio) of new columns, on a thread of rospy.
-    bass : str
-        Name of the node that publishes sceneTruth.
+    bass, localizer : str
+        Full names of the nodes that publish sceneTruth, and sources and posterior.
     """
 
     def __init__(
-        self, audio: Callable[[], Audio | None], append: Callable[[int, np.ndarray, float], None], bass: str
+        self,
+        audio: Callable[[], Audio | None],
+        append: Callable[[int, np.ndarray, float], None],
+        bass: str,
+        localizer: str,
     ) -> None:
         from rosAFE.msg import DirectionPosterior, SoundSources
 
         from bass.msg import SceneTruth
 
         self._audio, self._append = audio, append
-        self._world_frame = str(rospy.get_param(f"/{bass}/world_frame", "world")).strip("/") or "world"
+        self._world_frame = str(rospy.get_param(f"{bass}/world_frame", "world")).strip("/") or "world"
         self._lock = threading.Lock()
         self._next = 0  # number of the next column
         self._waiting: dict[int, dict[str, Any]] = {}  # by stamp, messages of one topic until that of the other arrives
@@ -60,9 +64,9 @@ class DirectionTopics:
         self._subscribers = [
             rospy.Subscriber(topic, message_class, callback, queue_size=10, tcp_nodelay=True)
             for topic, message_class, callback in (
-                ("/localizer/sources", SoundSources, self._receive_sources),
-                ("/localizer/posterior", DirectionPosterior, self._receive_posterior),
-                (f"/{bass}/sceneTruth", SceneTruth, self._receive_truth),
+                (f"{localizer}/sources", SoundSources, self._receive_sources),
+                (f"{localizer}/posterior", DirectionPosterior, self._receive_posterior),
+                (f"{bass}/sceneTruth", SceneTruth, self._receive_truth),
             )
         ]
 

@@ -9,7 +9,6 @@ from collections import deque
 from typing import Any
 
 STALE_AFTER_SECONDS = 3.5  # since the last message of a node, which sends one per second
-LOCALIZER = "localizer: localization"  # name of its status
 MAX_LOSSES = 50
 MAX_DIGITS = 15  # of a counter: JavaScript has no longer integers
 MAX_LOADS = 10_000  # processors
@@ -29,13 +28,15 @@ class Health:
 
     Parameters
     ----------
-    instance, bass : str
-        Names of the nodes.
+    rosafe, bass, localizer : str
+        Full names of the nodes.
     """
 
-    def __init__(self, instance: str, bass: str) -> None:
-        self._rosafe, self._bass = instance, bass
-        self._names = (f"{instance}: audio", f"{instance}: processors", f"{bass}: capture")
+    def __init__(self, rosafe: str, bass: str, localizer: str) -> None:
+        # The names of statuses begin with the full names of the nodes without the first slash.
+        self._rosafe, self._bass = rosafe.removeprefix("/"), bass.removeprefix("/")
+        self._names = (f"{self._rosafe}: audio", f"{self._rosafe}: processors", f"{self._bass}: capture")
+        self._localizer_name = f"{localizer.removeprefix('/')}: localization"
         self._localizer: tuple[float, str] | None = None  # time of the message (monotonic), and its text
         self._lock = threading.Lock()
         self._subscriber: Any = None
@@ -65,7 +66,7 @@ class Health:
 
     def _receive(self, message: Any) -> None:
         for status in message.status:
-            if status.name == LOCALIZER:
+            if status.name == self._localizer_name:
                 self._localizer = time.monotonic(), status.message[:MAX_TEXT]
             if status.name not in self._names:
                 continue

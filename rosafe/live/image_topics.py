@@ -32,7 +32,7 @@ class Images:
     def __init__(self, hub: Hub) -> None:
         self._hub = hub
         self._publishers = {
-            kind: rospy.Publisher(f"/rosafe_live/{kind}", Image, queue_size=1, tcp_nodelay=True) for kind in KINDS
+            kind: rospy.Publisher(f"rosafe_live/{kind}", Image, queue_size=1, tcp_nodelay=True) for kind in KINDS
         }
         self._views: dict[str, tuple[Key, View]] = {}
 

@@ -131,17 +131,17 @@ class Hub:
 
     Parameters
     ----------
-    bass : str
-        Name of the node that captures the audio.
+    bass, localizer : str
+        Full names of the nodes that capture the audio and localize.
     on_new_columns : callable
         Called on a thread of rospy when a view has new columns.
     """
 
-    def __init__(self, bass: str, on_new_columns: Callable[[], None]) -> None:
+    def __init__(self, bass: str, localizer: str, on_new_columns: Callable[[], None]) -> None:
         self.tree = TreeSnapshot()
         self.audio: Audio | None = None
         self.latencies: dict[str, float] = {}  # s, by topic: from the capture of the newest frame to its arrival
-        self._bass = bass
+        self._bass, self._localizer = bass, localizer
         self._directions: directions.DirectionTopics | None = None
         self._on_new_columns = on_new_columns
         self._views: dict[Key, View] = {}
@@ -204,12 +204,15 @@ class Hub:
         if key.what == "levels":
             view = View(6, 20.0, FLOAT, {"mode": "levels", "rows": 3, "ears": 2, "rate": 20.0})
             self._views[key] = view
-            self.audio = Audio(f"/{self._bass}/Audio", partial(_append_levels, view, self._on_new_columns))
+            self.audio = Audio(f"{self._bass}/Audio", partial(_append_levels, view, self._on_new_columns))
             return
         if key.what == "directions":
             self._views[key] = view = View(directions.SIZE, directions.RATE, FLOAT, directions.description())
             self._directions = directions.DirectionTopics(
-                lambda: self.audio, partial(_append_directions, view, self._on_new_columns), self._bass
+                lambda: self.audio,
+                partial(_append_directions, view, self._on_new_columns),
+                self._bass,
+                self._localizer,
             )
             return
         processor = self.tree.processors.get(key.name)

@@ -43,7 +43,7 @@ class CreatedProcessors:
         stored = await _list_parameter(graph, self._parameter)
         names = stored[1:] or self.names
         if stored[:1] != [node]:
-            restored = await _list_parameter(graph, f"/{instance}/{RESTORED_PARAM}")
+            restored = await _list_parameter(graph, f"{instance}/{RESTORED_PARAM}")
             names = [name for name in names if restored[:1] == [node] and name in restored[1:]]
         self.node, self.names = node, []
         await self._set(graph, names)

@@ -49,7 +49,7 @@ class FrameListener:
         self._status = NodeStatus(lambda: None)
         models = Models(settings)
         models.report = self._report_learning
-        afe = rospy.resolve_name(f"/{settings.rosafe.lstrip('/')}")
+        afe = rospy.resolve_name(settings.rosafe)
         self._clock = FrameClock(afe)
         self._lock = threading.Lock()  # of the source
         self._source: FrameSource | None = None

@@ -19,6 +19,7 @@ import rospy
 from rosafe.client.component_client import ComponentClient
 from rosafe.client.graph import Graph, NotRegisteredError
 from rosafe.client.tcpros import ServiceClient, component_exception
+from rosafe.declarations import ros_names
 from rosafe.dsp.framing import FrameGrid
 from rosafe.interface import BLOCK_AND_BUFFERS, REQUEST, ROSAFE, ComponentError, format_value
 from rosafe.localization import cues
@@ -70,7 +71,7 @@ class TreeLink:
     Parameters
     ----------
     instance : str
-        Name of the rosAFE node.
+        Full name of the rosAFE node.
     connect : str
         Topic of the sound, if an input has to be created.
     model_for : callable
@@ -92,7 +93,7 @@ class TreeLink:
         status: NodeStatus,
         is_stalled: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._instance = instance.strip("/")
+        self._instance = instance
         self._connect = connect
         self._model_for = model_for
         self._established, self._is_stalled = established, is_stalled
@@ -179,7 +180,7 @@ class TreeLink:
                 await self._check(client)
                 await self._created.store_again(graph)
         except TimeoutError:
-            raise _Waiting(f"waiting for rosAFE: /{self._instance} does not answer") from None
+            raise _Waiting(f"waiting for rosAFE: {self._instance} does not answer") from None
         except ComponentError as problem:
             if self._watched:  # rosAFE has ended
                 raise _Waiting(_reason(problem)) from None
@@ -195,7 +196,7 @@ class TreeLink:
         try:
             node = await graph.node_uri(self._instance)
         except NotRegisteredError:  # it ends, or the master has restarted
-            raise _Waiting(f"waiting for rosAFE: /{self._instance} is not registered at the master") from None
+            raise _Waiting(f"waiting for rosAFE: {self._instance} is not registered at the master") from None
         await self._created.recall(graph, self._instance, node)
         if processors := await tree_builder.list_processors(client):  # otherwise a tree may still be restored
             await self._created.keep(graph, (processor.name for processor in processors))
@@ -260,13 +261,13 @@ class TreeLink:
         except ComponentError as problem:
             self._input_of = ""  # after Stop an input is created
             raise _Waiting(
-                f"waiting for rosAFE: {problem.what}: rosservice call /{self._instance}/Stop removes its processors"
+                f"waiting for rosAFE: {problem.what}: rosservice call {self._instance}/Stop removes its processors"
             ) from None
 
     async def _sound_rate(self, client: ComponentClient) -> int:
         """Return the sample rate of the sound, 0 if there is none: rosAFE logs requests that fail for want of it."""
         topic = self._connect or await client.port_connected("Audio") or REQUEST.parameter("connect").default
-        topic = rospy.resolve_name(f"/{topic.lstrip('/')}")
+        topic = rospy.resolve_name(ros_names.resolve(topic, self._instance))
         rate = await sound_rate(topic, SOUND_SECONDS)
         if not rate:
             self._status.set("rosAFE", WARN, f"waiting for sound on {topic}")

@@ -12,6 +12,7 @@ import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.component.activities import Activities, Handler
+from rosafe.declarations import ros_names
 from rosafe.interface import RESTORED_PARAM, ROSAFE, ComponentError, Representation
 from rosafe.node.audio_input import AudioInput
 from rosafe.node.tree_state_file import TreeStateFile
@@ -88,13 +89,15 @@ class SavedTree:
 
     def _setup(self) -> Setup:
         """Return the current tree, or the one that is still to be restored, with the current connection."""
-        connections = {"Audio": self._audio.topic} if self._audio.topic else {}
+        topic = self._audio.topic
+        connections = {"Audio": ros_names.relative(topic, rospy.get_name())} if topic else {}
         return Setup(self._sound, connections, self._pending.processors or self._processors())
 
     def restore(self, finished: threading.Event) -> None:
         """Connect to the saved topic, and start a thread that restores the tree; it ends when `finished` is set."""
         topic = self._pending.connections.get("Audio", "")
         if topic:
+            topic = ros_names.resolve(topic, rospy.get_name())
             self._audio.connect(topic)  # it need not have a publisher yet
             self.save()
         if self._pending.processors:

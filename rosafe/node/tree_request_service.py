@@ -7,6 +7,8 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import rospy
+
 from rosafe.component.component import ComponentNode
 from rosafe.interface import ROSAFE, ComponentError
 from rosafe.setups import read_parameters
@@ -22,8 +24,8 @@ class TreeRequestService:
     """
 
     def __init__(self, node: ComponentNode, audio_topic: Callable[[], str]) -> None:
-        self.instance = node.name.strip("/")
-        self._node = node
+        self.node = node.name
+        self._component = node
         self._audio_topic = audio_topic
         self.turns = tree_builder.Turns()
         self._building = threading.Lock()  # one tree at a time: a failing request must not remove another's processors
@@ -42,7 +44,7 @@ class TreeRequestService:
 
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """Call a service of the node; an activity has no outputs, and is running then. Raises ComponentError."""
-        outputs = self._node.call_service(service, values)  # may block the event loop, which has no other task
+        outputs = self._component.call_service(service, values)  # may block the event loop, which has no other task
         message = outputs.get("response")
         if message is None:
             return outputs
@@ -55,6 +57,6 @@ class TreeRequestService:
     async def published(self, topic: str) -> bool:
         """Return whether `topic` has a publisher."""
         try:
-            return topic in master.published_topics(master.uri(), self._node.name)
+            return rospy.resolve_name(topic) in master.published_topics(master.uri(), self.node)
         except master.MasterError as problem:
             raise ComponentError("::genom::port_io", str(problem)) from None

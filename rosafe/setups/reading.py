@@ -79,7 +79,7 @@ def _connections(node: YamlNode) -> Iterator[tuple[str, str]]:
         if len(topic) > MAX_STRING or not _TOPIC.fullmatch(topic):
             what = f"connections: expected the name of a topic, such as bass/Audio, got {short_repr(topic)}"
             raise SetupError(value.line, what)
-        yield port, f"/{topic.removeprefix('/')}"
+        yield port, topic
 
 
 # --- parameters -------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Awaitable, Iterable, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, Protocol, TypeVar
 
+from rosafe.declarations import ros_names
 from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, REQUEST, ROSAFE, ComponentError
 from rosafe.representations import BUILTIN
 from rosafe.tree import tree_planner
@@ -83,7 +84,7 @@ class Turns:
 class Services(Protocol):
     """The services of a rosAFE."""
 
-    instance: str
+    node: str  # full name of the node
     turns: Turns
 
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -118,7 +119,7 @@ async def build(component: Services, values: Mapping[str, Any]) -> dict[str, Any
         await shield_until_done(remove(component, created))
         raise
     component.turns.keep(dependencies)
-    return tree_planner.build_response(request, dependencies, created, component.instance)
+    return tree_planner.build_response(request, dependencies, created, component.node)
 
 
 def _has_plugins(request: TreeRequest) -> bool:
@@ -151,7 +152,7 @@ async def find(component: Services, values: Mapping[str, Any]) -> dict[str, Any]
     if plan.steps:
         missing = ", ".join(step.service for step in plan.steps if step.creates)
         raise ROSAFE.error("e_noSuchProcessor", what=f"there is none with these parameters; missing: {missing}")
-    return tree_planner.build_response(request, plan.dependencies, (), component.instance)
+    return tree_planner.build_response(request, plan.dependencies, (), component.node)
 
 
 async def _parse(values: Mapping[str, Any]) -> TreeRequest:
@@ -220,7 +221,7 @@ async def _connect(component: Services, request: TreeRequest) -> None:
     topic = str(request.explicit.get("connect", ""))
     if not topic and not await component.port_connected("Audio"):
         default = REQUEST.parameter("connect").default
-        topic = default if await component.published(f"/{default}") else ""
+        topic = default if await component.published(ros_names.resolve(default, component.node)) else ""
     if topic:
         await component.outputs("connect_port", {"local": "Audio", "remote": topic})
 

@@ -245,7 +245,7 @@ def creation_call(spec: ProcessorSpec, name: str, parent: str, input_values: Map
 
 
 def build_response(
-    request: TreeRequest, dependencies: Sequence[str], created: Collection[str], instance: str
+    request: TreeRequest, dependencies: Sequence[str], created: Collection[str], node: str
 ) -> dict[str, Any]:
     """Return the outputs of `interface.REQUEST` when the processors `dependencies` exist."""
     kinds = [spec.kind for spec in request.specs]
@@ -256,7 +256,7 @@ def build_response(
         "reused": [name for name in dependencies if name not in created],
         "unused": unused(kinds, request.explicit, dependencies[0] in created),
         "port": kinds[-1].port,
-        "topic": topic(instance, kinds[-1], dependencies[-1]),
+        "topic": topic(node, kinds[-1], dependencies[-1]),
     }
 
 
@@ -266,9 +266,9 @@ def unused(kinds: Iterable[Representation], names: Iterable[str], new_input: boo
     return [name for name in names if name not in own]
 
 
-def topic(instance: str, kind: Representation, name: str) -> str:
+def topic(node: str, kind: Representation, name: str) -> str:
     """Return the topic of the processor `name`."""
-    return f"/{instance}/{kind.port}" + (f"/{name}" if ROSAFE.port(kind.port).multiple else "")
+    return f"{node}/{kind.port}" + (f"/{name}" if ROSAFE.port(kind.port).multiple else "")
 
 
 def chain_exists(dependencies: Sequence[str], found: Iterable[ExistingProcessor]) -> bool:

@@ -28,7 +28,7 @@ oo::class create ::genomix::Client {
     # load component ?-i instance? ?as name?
     #
     # Create commands for the services and ports of a running component in the namespace ::name, and return the name.
-    # The default is the name of the instance, or of the component.
+    # The default is the name of the instance, or of the component; an instance robot1/rosAFE is named robot1_rosAFE.
     method load {component args} {
         set query {}
         foreach {option value} $args {
@@ -43,7 +43,6 @@ oo::class create ::genomix::Client {
         if {[llength $args] % 2} {
             ::genomix::Refuse "load: expected a value for [lindex $args end]"
         }
-        set component [file rootname [file tail $component]]
         set description [my get [list load $component] $query]
         if {[catch {dict get $description name} name]
             || [catch {dict size [dict get $description services]}] || [catch {dict size [dict get $description ports]}]
