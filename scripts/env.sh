@@ -10,6 +10,7 @@ if [ -n "${BASH_VERSION:-}" ]; then
 elif [ -n "${ZSH_VERSION:-}" ]; then
   # shellcheck disable=SC2016
   eval '_rosafe_file=${(%):-%x}'
+  [ -e "$_rosafe_file" ] || _rosafe_file=$0 # %x shows a line break as \n
 else
   # dash has no variable with the name of a sourced file, but it has the file open. The process id comes from a child's
   # $PPID, since $$ in a subshell is not the id of the subshell.
@@ -29,7 +30,10 @@ fi
 _rosafe_status=1
 _rosafe_root=$(realpath -- "$_rosafe_file" 2>/dev/null) || :
 _rosafe_root=${_rosafe_root%/scripts/env.sh}
-if [ ! -f "$_rosafe_root/rosafe/component/generate.py" ]; then
+_rosafe_path=$(printf '%s' "$_rosafe_root" | tr '\n' ':')
+if [ "$_rosafe_path" != "${_rosafe_path%%:*}" ]; then
+  echo "rosafe: checkout: expected a path without : and line breaks, which separate folders in PATH and PYTHONPATH, got $_rosafe_path; rename or move it" >&2
+elif [ ! -f "$_rosafe_root/rosafe/component/generate.py" ]; then
   echo "rosafe: the folder of env.sh cannot be determined in this shell; change into the checkout, then: . scripts/env.sh" >&2
 elif [ ! -x /usr/bin/python3 ]; then
   echo "rosafe: /usr/bin/python3 is missing; run $_rosafe_root/scripts/install" >&2
@@ -39,7 +43,7 @@ elif _rosafe_exports=$(PYTHONPATH="$_rosafe_root${PYTHONPATH:+:$PYTHONPATH}" \
   _rosafe_status=0
 fi
 
-unset _rosafe_file _rosafe_link _rosafe_target _rosafe_root _rosafe_exports
+unset _rosafe_file _rosafe_link _rosafe_target _rosafe_root _rosafe_path _rosafe_exports
 if [ "$_rosafe_status" = 1 ]; then
   unset _rosafe_status
   return 1

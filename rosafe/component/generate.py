@@ -321,6 +321,12 @@ def environment() -> dict[str, str]:
 def _prepend_path(separator: str, variable: str, directories: list[Path]) -> str:
     """Return the list in `variable` with `directories` prepended, each entry once."""
     first = [f"{{{d}}}" if separator == " " and " " in str(d) else str(d) for d in directories]
+    for entry in first:
+        if separator == ":" and (":" in entry or "\n" in entry):
+            raise GenerationError(
+                f"{variable}: expected folders without : and line breaks, got {entry!r}; rename or move it, or set "
+                "XDG_CACHE_HOME if it is the cache"
+            )
     present = f"{separator}{os.environ.get(variable, '')}{separator}"
     for entry in first:
         # The list is not split, because entries of a Tcl list may contain blanks.
