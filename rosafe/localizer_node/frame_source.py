@@ -273,12 +273,12 @@ class FrameSource:
         """
         with self.lock:
             newest = self._newest_block()
-            if not self.is_ready() or not self._has_time(newest):
+            if not self.is_ready() or newest == self._index or not self._has_time(newest):  # or all are sent again
                 return None
             if not all(port.decode(newest) for port in self._ports):
                 return None
             before, self._index = self._index, newest
-            restarted = self._index <= before
+            restarted = self._index < before
             if not before or restarted:
                 self._first, self._done, self._end = self._index, 0, self._index - 1 - self.format.rest
             for port in self._ports:

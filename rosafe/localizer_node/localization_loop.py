@@ -153,7 +153,7 @@ class LocalizationLoop:
         try:
             new = source.take()
         except StreamRestartedError as restart:
-            rospy.logwarn(f"a new stream of sound: {restart}; localization begins again")
+            _report(f"a new stream of sound: {restart}; localization begins again", "stream")
             self._begin_again()
             return False
         if source.problem:
@@ -168,7 +168,9 @@ class LocalizationLoop:
         middles = used.frames.middles
         steps = np.diff(middles, prepend=self._newest or middles[0])
         if steps.min() < -TIME_SLACK or steps.max() > MAX_PAUSE:
-            rospy.logwarn(f"the time jumped by {steps[np.abs(steps).argmax()]:.3f} s; localization begins again")
+            jump = steps[np.abs(steps).argmax()]
+            why = "; is /clock published, and does it advance?" if jump < 0 else ""
+            _report(f"the time of the frames jumped by {jump:.3f} s{why}; localization begins again", "time")
             self._begin_again()
             return False
         middles = np.maximum.accumulate(middles)

@@ -11,7 +11,9 @@ import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.terminal import printable
+from rosafe.transport.log_throttle import ThrottledLog
 
+LOG_SECONDS = 10.0  # in which problems that differ only in numbers are logged once
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -30,10 +32,15 @@ class NodeStatus:
         self._causes: dict[str, tuple[int, str]] = {}  # by part of the node
         self._values: dict[str, str] = {}
         self._logged = ""
+        self._log = {
+            OK: ThrottledLog(rospy.loginfo),
+            WARN: ThrottledLog(rospy.logwarn, LOG_SECONDS),
+            ERROR: ThrottledLog(rospy.logerr, LOG_SECONDS),
+        }
         self._errors: set[tuple[type, str]] = set()  # unexpected ones that are in the log: class and place
 
     def set(self, part: str, level: int, text: str, log: bool = True) -> None:
-        """Set the state of a part of the node; a new text of the whole node is logged once."""
+        """Set the state of a part of the node; a new text of the whole node is logged."""
         with self._lock:
             self._causes.pop(part, None)
             self._causes[part] = level, text
@@ -43,7 +50,7 @@ class NodeStatus:
                 self._logged = text
         if new:
             if log:
-                {OK: rospy.loginfo, WARN: rospy.logwarn, ERROR: rospy.logerr}[level](text)
+                self._log[level](text)
             self._changed()
 
     def set_error(self, part: str, problem: Exception) -> None:

@@ -30,6 +30,7 @@ from rosafe.localizer_node.sound_probe import sound_rate
 from rosafe.localizer_node.status import OK, WARN, NodeStatus
 from rosafe.terminal import printable
 from rosafe.transport import registration
+from rosafe.transport.log_throttle import ThrottledLog
 from rosafe.tree import tree_builder
 from rosafe.tree.tree_planner import ExistingProcessor
 
@@ -40,6 +41,8 @@ CALL_SECONDS = 30.0
 MAX_PAUSE = 16.0  # s between two requests that fail
 REMOVE_SECONDS = 2.0  # for the processors to be removed at the end
 STOPPED = "rosAFE was stopped: waiting for an input (InputProc, rosafe request, or a setup), or a restart of rosAFE"
+
+_report = ThrottledLog(rospy.logwarn, 60.0)
 
 
 @dataclass(frozen=True)
@@ -323,9 +326,9 @@ def _report_block(status: NodeStatus, block: int, hop: int, rate: float) -> None
     status.value("block of rosAFE (frames)", block)
     more = 1000 * (block / rate - BLOCK_SECONDS)
     if more > 1:
-        rospy.logwarn(f"the input of rosAFE has blocks of {block} frames: they add {more:.0f} ms to the latency")
+        _report(f"the input of rosAFE has blocks of {block} frames: they add {more:.0f} ms to the latency")
     if block % hop:
-        rospy.logwarn(
+        _report(
             f"the blocks of rosAFE ({block} frames) are not a multiple of the hop ({hop}): the frames of "
             "processors that were created one after another do not coincide, and sources are found less often"
         )

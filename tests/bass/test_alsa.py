@@ -482,6 +482,25 @@ def test_samples_of_the_file_plugin_are_exact(real_alsa: Path) -> None:
     assert np.array_equal(np.concatenate([c.samples for c in chunks if c], axis=1), samples)
 
 
+def test_an_edited_configuration_is_used_by_the_next_acquisition(
+    real_alsa: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a bass that runs while the user edits ~/.asoundrc; /usr/share/alsa/alsa.conf includes this file."""
+    monkeypatch.delenv("ALSA_CONFIG_PATH")
+    monkeypatch.setenv("HOME", str(real_alsa))
+    with pytest.raises(ComponentError):
+        open_source("edited", 44100, 2205, threading.Event())
+    for value in (1, 2):
+        np.full((2205, 2), value, "<i4").tofile(real_alsa / f"{value}.raw")
+        (real_alsa / ".asoundrc").write_text(
+            f'pcm.edited {{ type file slave.pcm "null" file /dev/null infile "{real_alsa}/{value}.raw" format raw }}'
+        )
+        source = open_source("edited", 44100, 2205, threading.Event())
+        chunk = source.read()
+        source.close()
+        assert chunk is not None and (chunk.samples == value).all()
+
+
 def test_plug_and_channel_options_work(real_alsa: Path) -> None:
     samples = np.random.default_rng(2).integers(-(2**31), 2**31, (4, 1000)).astype("<i4")
     samples.T.tofile(real_alsa / "samples.raw")

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from rosafe.bass.sources.base import Chunk, Chunker, device_error, parse_options
-from rosafe.bass.sources.libasound import captured_alsa_errors, load_alsaaudio
+from rosafe.bass.sources.libasound import captured_alsa_errors, forget_configuration, load_alsaaudio
 from rosafe.bass.sources.pcm import MAX_CHANNELS, RING_CHUNKS, PcmOpener
 from rosafe.bass.sources.pcmname import checked_name
 from rosafe.interface import ComponentError
@@ -97,6 +97,7 @@ class AlsaSource:
         self.overruns = 0
         self.lost_frames = 0
         name, _, options = device.partition("?")
+        forget_configuration()
         with captured_alsa_errors():
             pcm_name = checked_name(name)
         channels: tuple[int, int] | None = parse_options(device, options, _OPTIONS).get("channels")

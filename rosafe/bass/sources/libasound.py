@@ -62,6 +62,12 @@ def captured_alsa_errors() -> Iterator[list[str]]:
         library.snd_lib_error_set_local(before)
 
 
+def forget_configuration() -> None:
+    """Let libasound read its configuration again: by itself it notices changes of alsa.conf, but not of ~/.asoundrc."""
+    with contextlib.suppress(OSError):
+        ctypes.CDLL("libasound.so.2").snd_config_update_free_global()
+
+
 def capture_devices(proc: Path = Path("/proc/asound")) -> list[tuple[int, int, str, str]]:
     """Return (card, device, card id, PCM id) of the capture PCMs of all sound cards, as listed by the kernel in `proc`.
 
