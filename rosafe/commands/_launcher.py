@@ -213,4 +213,5 @@ def environment() -> dict[str, str]:
     from rosafe.component import generate
 
     master.set_local_defaults()
+    master.check_family()
     return {**os.environ, **generate.environment()}

@@ -44,8 +44,10 @@ def run(options: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     from rosafe.component import startup
     from rosafe.interface import ComponentError
+    from rosafe.transport import master
 
     prepare()
+    master.check_family()
     startup.ensure_log_directory()
     from rosafe.http_server.listener import ListenError
     from rosafe.live import daemon

@@ -217,6 +217,7 @@ def _start(
     malloc_tuning.limit_arenas()
     master.set_local_defaults()
     master.check_address(os.environ["ROS_MASTER_URI"])  # an invalid one is an error immediately
+    master.check_family()
     warning = master.unreachable()
     if warning:
         print(f"{program}: warning: {printable(warning)}", file=sys.stderr, flush=True)
@@ -310,6 +311,7 @@ def become_node(name: str) -> None:
     from rosafe.transport import registration
 
     master.set_local_defaults()
+    master.check_family()
     master.check_master(os.environ["ROS_MASTER_URI"])
     generate.ensure_messages()
     ensure_log_directory()

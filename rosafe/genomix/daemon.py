@@ -36,10 +36,11 @@ def main(argv: list[str] | None = None) -> int:
         return fork.wait()
     master.set_local_defaults()
     try:
+        master.check_family()
         generate.ensure_messages()
         startup.ensure_log_directory()
         return asyncio.run(_serve(options, fork))
-    except (generate.GenerationError, OSError, ValueError) as problem:
+    except (generate.GenerationError, master.MasterError, OSError, ValueError) as problem:
         print(f"genomixd: {printable(str(problem))}", file=sys.stderr)
         return 1
 

@@ -9,7 +9,7 @@ import rospy
 
 from rosafe.client.component_client import ComponentClient
 from rosafe.client.graph import Graph, NotRegisteredError
-from rosafe.interface import RESTORED_PARAM, ComponentError
+from rosafe.interface import RESTORED_PARAM
 from rosafe.transport import registration
 from rosafe.tree import tree_builder
 
@@ -17,7 +17,8 @@ from rosafe.tree import tree_builder
 class CreatedProcessors:
     """The names of the processors, without the input, which cannot be removed.
 
-    The private ROS parameter ~created contains them too, for a node of the same name that replaces this one.
+    The private ROS parameter ~created contains them too, for a node of the same name that replaces this one; a
+    restarted master gets it again.
 
     Attributes
     ----------
@@ -30,7 +31,6 @@ class CreatedProcessors:
     def __init__(self) -> None:
         self.names: list[str] = []
         self.node = ""
-        self._forgotten = 0  # `times_forgotten` when the parameter was set
         self._parameter = rospy.resolve_name("~created")
 
     async def recall(self, graph: Graph, instance: str, node: str) -> None:
@@ -61,24 +61,15 @@ class CreatedProcessors:
     async def _set(self, graph: Graph, names: list[str]) -> None:
         if names != self.names:
             self.names = names
-            await self._store(graph)
-
-    async def _store(self, graph: Graph) -> None:
-        forgotten = registration.registrar().times_forgotten
-        await graph.master("setParam", self._parameter, [self.node, *self.names])
-        self._forgotten = forgotten
-
-    async def store_again(self, graph: Graph) -> None:
-        """Set the parameter if the master, which had it, has been restarted."""
-        if self.names and registration.registrar().times_forgotten != self._forgotten:
-            with contextlib.suppress(ComponentError):  # it has ended again
-                await self._store(graph)
+            stored = registration.registrar().parameters[self._parameter] = [self.node, *names]
+            await graph.master("setParam", self._parameter, stored)
 
     async def remove(self, graph: Graph, client: ComponentClient) -> None:
         """Remove them from rosAFE, except those with children of other clients."""
         await tree_builder.remove(client, self.names)
         await self.keep(graph, (processor.name for processor in await tree_builder.list_processors(client)))
         if not self.names:
+            registration.registrar().parameters.pop(self._parameter, None)
             with contextlib.suppress(NotRegisteredError):
                 await graph.master("deleteParam", self._parameter)
 

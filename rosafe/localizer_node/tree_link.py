@@ -181,7 +181,6 @@ class TreeLink:
             while not self._closing:
                 await self._pause()
                 await self._check(client)
-                await self._created.store_again(graph)
         except TimeoutError:
             raise _Waiting(f"waiting for rosAFE: {self._instance} does not answer") from None
         except ComponentError as problem:

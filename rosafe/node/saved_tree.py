@@ -17,16 +17,18 @@ from rosafe.interface import RESTORED_PARAM, ROSAFE, ComponentError, Representat
 from rosafe.node.audio_input import AudioInput
 from rosafe.node.tree_state_file import TreeStateFile
 from rosafe.setups import Setup, SetupProcessor, dry_run
-from rosafe.transport import master
+from rosafe.transport import master, registration
 from rosafe.tree.tree import Tree
 
 POLL_SECONDS = 0.1  # between two checks whether there is audio for the tree to restore
 
 
 def _announce(names: list[str]) -> None:
-    """Store the names of the processors to restore, for clients that know them, unless the master does not answer."""
+    """Store the names of the processors to restore, for clients that know them; also in a master that starts later."""
+    value = [rospy.get_node_uri(), *names]
+    registration.registrar().parameters[rospy.resolve_name(f"~{RESTORED_PARAM}")] = value
     with contextlib.suppress(*master.FAILURES):
-        rospy.set_param(f"~{RESTORED_PARAM}", [rospy.get_node_uri(), *names])
+        rospy.set_param(f"~{RESTORED_PARAM}", value)
 
 
 class SavedTree:

@@ -30,7 +30,7 @@ def set_local_defaults(environ: MutableMapping[str, str] = os.environ) -> None:
     """Set ROS variables that are unset or empty, so that ROS works on this machine alone.
 
     The address is 127.0.0.1 because rospy waits forever for `localhost` on a machine without /etc/hosts. ROS_IP is not
-    set if the master is on another host, which could not call back to loopback. Empty variables are removed because
+    set if the master is on another host, which could not call back to loopback, or with ROS_IPV6=on. Empty variables are removed because
     rospy logs a warning about them repeatedly.
     """
     for variable in ("ROS_HOSTNAME", "ROS_IP"):
@@ -38,7 +38,8 @@ def set_local_defaults(environ: MutableMapping[str, str] = os.environ) -> None:
             del environ[variable]
     if not environ.get("ROS_MASTER_URI"):
         environ["ROS_MASTER_URI"] = DEFAULT_URI
-    if not (environ.get("ROS_IP") or environ.get("ROS_HOSTNAME")) and is_local(environ["ROS_MASTER_URI"]):
+    named = environ.get("ROS_IP") or environ.get("ROS_HOSTNAME") or environ.get("ROS_IPV6") == "on"
+    if not named and is_local(environ["ROS_MASTER_URI"]):
         environ["ROS_IP"] = "127.0.0.1"
 
 
@@ -63,7 +64,9 @@ def unreachable(environ: Mapping[str, str] = os.environ) -> str:
 
     A node registers ROS_HOSTNAME, or ROS_IP if that is not set, as its address at the master.
     """
-    variable = next((v for v in ("ROS_HOSTNAME", "ROS_IP") if environ.get(v)), "")
+    if problem := wrong_family(environ):
+        return problem
+    variable = _address_variable(environ)
     if not variable:
         return ""
     host, uri = environ[variable], environ.get("ROS_MASTER_URI") or DEFAULT_URI
@@ -79,6 +82,37 @@ def unreachable(environ: Mapping[str, str] = os.environ) -> str:
     else:
         return ""
     return f"{variable} is {host}, {problem}; unset it or set it to {_own_addresses(is_local(uri))}"
+
+
+def _address_variable(environ: Mapping[str, str]) -> str:
+    return next((variable for variable in ("ROS_HOSTNAME", "ROS_IP") if environ.get(variable)), "")
+
+
+def wrong_family(environ: Mapping[str, str] = os.environ) -> str:
+    """Return why rospy's nodes would listen at other addresses than they register; empty if they would not.
+
+    rospy listens for IPv6 only with ROS_IPV6=on, then at ::1 only for a loopback address, and it puts no brackets
+    around an IPv6 address in a URI.
+    """
+    variable = _address_variable(environ)
+    host, ipv6 = environ.get(variable, ""), environ.get("ROS_IPV6") == "on"
+    if ":" in host:
+        return (
+            f"{variable}: expected an IPv4 address or a name, because ROS nodes with an IPv6 address cannot be called, "
+            f"got {host}; set it to an IPv4 address, or set ROS_IPV6=on and ROS_HOSTNAME to a name of that address"
+        )
+    found = _addresses(host) if host else []
+    if ipv6 and found and _is_loopback(host) and "::1" not in found:
+        return f"{variable}: expected a name of ::1, because of ROS_IPV6=on, got {host}; unset ROS_IPV6 or {variable}"
+    if not ipv6 and found and all(":" in address for address in found):
+        return f"{variable}: expected an IPv4 address or a name of one, got {host} ({found[0]}); set ROS_IPV6=on for IPv6"
+    return ""
+
+
+def check_family() -> None:
+    """Raise MasterError if nodes of this environment would listen at other addresses than they register."""
+    if problem := wrong_family():
+        raise MasterError(problem)
 
 
 def _addresses(host: str) -> list[str]:

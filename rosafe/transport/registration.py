@@ -63,9 +63,9 @@ class Registrar(RegistrationListener):
 
     def __init__(self, manager: RegManager) -> None:
         self.changes = 0  # number of changes of the offered topics and services
-        self.times_forgotten = 0  # how often the master, usually restarted, did not know this node any more
         self.manager = manager
         self._name = rospy.get_name()
+        self.parameters: dict[str, Any] = {}  # ROS parameters by full name, which a restarted master gets again
         self._succession: Succession = manager.handler.succession
         self._succession.on_contest = self._register_all_again
         self._master: Any = master.proxy(manager.master_uri)
@@ -174,8 +174,9 @@ class Registrar(RegistrationListener):
         """Register exactly `offered` at the master."""
         forgotten = not self._is_known()
         if forgotten:
-            self.times_forgotten += 1
             self._last_reported.clear()
+            for name in list(self.parameters):
+                self._call("setParam", name, self.parameters.get(name))
         for entry in [e for key, e in self._last_reported.items() if offered.get(key) is not e]:
             self._call(f"unregister{_NOUNS[entry.kind]}", entry.name, self._provider(entry))
             del self._last_reported[entry.kind, entry.name]
@@ -198,7 +199,7 @@ class Registrar(RegistrationListener):
         self._pid = pid
         return same and code == 1 and owner == self.manager.uri
 
-    def _call(self, method: str, *arguments: str) -> Any:
+    def _call(self, method: str, *arguments: Any) -> Any:
         with self._succession.registration_lock:
             if self._ended or self._succession.over:
                 raise OSError("the node ends")

@@ -135,7 +135,7 @@ def test_a_sound_that_is_not_heard(
     graph: Graph, rosafe_node: Process, sphere_model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     graph.client()
-    ordinary = SimpleNamespace(is_replaced=False, times_forgotten=0)  # this process is a node of rospy
+    ordinary = SimpleNamespace(is_replaced=False, parameters={})  # this process is a node of rospy
     monkeypatch.setattr(registration, "_registrar", ordinary)
     monkeypatch.setattr(ear_check, "QUIET_SECONDS", 0.5)
     monkeypatch.setattr(ear_check, "WAIT_SECONDS", 1.0)

@@ -16,6 +16,7 @@ from typing import Any, cast
 
 import pytest
 import rospy
+import yaml
 from diagnostic_updater import DiagnosticStatusWrapper
 
 from rosafe.component.activities import Activities
@@ -24,7 +25,7 @@ from rosafe.node.audio_input import AudioInput
 from rosafe.node.saved_tree import SavedTree
 from rosafe.setups import read
 from rosafe.tree.tree import Tree
-from tests.harness import PATIENCE, Graph, wait_for
+from tests.harness import PATIENCE, Graph, MasterProcess, wait_for
 from tests.ros.session import Microphone, Session, noise, own_node
 
 KILLS = int(os.environ.get("ROSAFE_KILLS", "3"))
@@ -211,3 +212,24 @@ def test_a_failure_to_write_is_reported_and_the_node_continues(graph: Graph, tmp
         node.ok("PreProc")
         assert len(read((folder / "tree.yaml").read_text()).processors) == 2
         assert node.health(lambda entries: entries["level"] == "0", "keep")["message"] == "the tree is kept"
+
+
+def test_a_new_master_gets_the_names_of_the_restored_processors(
+    private_graph: tuple[Graph, MasterProcess], tmp_path: Path
+) -> None:
+    """Clients such as the localizer recognize their processors by them."""
+    graph, master = private_graph
+    tree = tmp_path / "tree.yaml"
+    tree.write_text("processors:\n  input: {kind: input}\n  mine: {kind: preProc}\n")
+
+    def stored() -> list[str]:
+        done = graph.run("rosparam", "get", "/rosAFE/restored", check=False)
+        return list(yaml.safe_load(done.stdout)) if done.returncode == 0 else []
+
+    with graph.node("rosAFE-ros", "--keep", str(tree)) as node:
+        before = stored()
+        assert before[1:] == ["input", "mine"] and before[0].startswith("http://127.0.0.1:")
+        master.kill()
+        wait_for(lambda: "no answer from the ROS master" in node.err, what=lambda: str(node))
+        master.start(graph.env)
+        wait_for(lambda: stored() == before, what=lambda: f"{before} in {stored()}: {node}")

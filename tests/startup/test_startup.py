@@ -235,6 +235,31 @@ def test_an_unreachable_address_is_reported(
         wait_for(lambda: node.err.endswith(f"{program}: ready as /{name} at {graph.uri}\n"), what=lambda: str(node))
 
 
+@pytest.mark.parametrize(
+    ("command", "env"),
+    [
+        (("rosAFE-ros",), {"ROS_IP": "::1"}),
+        (("bass-ros", "-b"), {"ROS_IP": "::1", "ROS_IPV6": "on"}),
+        (("bass-ros", "__ip:=fe80::1%lo"), {}),
+        (("rosafe", "localize"), {"ROS_HOSTNAME": "::1"}),
+        (("genomixd", "-p", "0"), {"ROS_IP": "[::1]"}),
+        (("rosafe", "live", "--port", "0"), {"ROS_IP": "::ffff:127.0.0.1"}),
+        (("rosafe", "record"), {"ROS_IP": "::1"}),
+        (("rosafe", "up"), {"ROS_IP": "::1"}),
+    ],
+)
+def test_ipv6_addresses_are_refused(graph: Graph, command: tuple[str, ...], env: dict[str, str]) -> None:
+    """rospy would register a URI that no client can parse."""
+    done = graph.run(*command, check=False, **{"ROS_IP": "", **env})
+    assert done.returncode == 1 and "expected an IPv4 address or a name" in done.stderr, done
+    assert done.stderr.count("\n") == 1 and "set it to an IPv4 address, or set ROS_IPV6=on" in done.stderr
+
+
+def test_without_an_address_nodes_work_with_ipv6(graph: Graph) -> None:
+    with graph.node("bass-ros", "-i", "sixth", ROS_IP="", ROS_IPV6="on"):
+        assert graph.call("/sixth/ListDevices").genom_success
+
+
 # --- up and down ------------------------------------------------------------------------------------------------
 
 
