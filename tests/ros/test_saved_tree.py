@@ -154,6 +154,7 @@ def test_a_tree_that_cannot_be_restored_completely_is_removed(
         error = ComponentError("::rosAFE::e_memory") if service.name == "PreProc" else None
         return SimpleNamespace(begun=begun, error=error)
 
+    monkeypatch.setattr(registration, "_registrar", SimpleNamespace(parameters={}))
     saved = SavedTree(
         file,
         cast(AudioInput, SimpleNamespace(topic="", ring=SimpleNamespace(sample_rate=44100))),

@@ -257,7 +257,7 @@ def test_ipv6_addresses_are_refused(graph: Graph, command: tuple[str, ...], env:
 
 def test_without_an_address_nodes_work_with_ipv6(graph: Graph) -> None:
     with graph.node("bass-ros", "-i", "sixth", ROS_IP="", ROS_IPV6="on"):
-        assert graph.call("/sixth/ListDevices").genom_success
+        assert graph.call("/sixth/getAcquisition").genom_success
 
 
 # --- up and down ------------------------------------------------------------------------------------------------
