@@ -289,9 +289,9 @@ class ComponentClient:
         return topic in await self.graph.topics()
 
     @contextlib.asynccontextmanager
-    async def other(self, instance: str) -> AsyncIterator[ComponentClient]:
-        """Yield a client of another component; ComponentError if there is none of that name."""
-        client = await ComponentClient.load(self.graph, self.graph.shorten(instance))
+    async def other(self, node: str) -> AsyncIterator[ComponentClient]:
+        """Yield a client of another component by its full name; ComponentError if there is none."""
+        client = await ComponentClient.load(self.graph, self.graph.shorten(node))
         try:
             yield client
         finally:

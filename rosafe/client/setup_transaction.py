@@ -35,8 +35,8 @@ Undo = Callable[[], Awaitable[object]]
 class ComponentProtocol(Services, Protocol):
     """The rosAFE component that a setup is saved from or loaded into, with access to the other components."""
 
-    def other(self, instance: str) -> AbstractAsyncContextManager[Services]:
-        """Return another component of the graph; ComponentError if there is none of that name."""
+    def other(self, node: str) -> AbstractAsyncContextManager[Services]:
+        """Return another component of the graph by its full name; ComponentError if there is none."""
 
 
 async def save(component: ComponentProtocol, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -154,7 +154,10 @@ async def _sound(
         return ""
     async with _bass(component, topic) as bass:
         if bass is None:
-            raise middleware_error(f"the setup has a sound, but no bass publishes {topic}; start it with: bass-ros")
+            what = f"the setup has a sound, but no bass publishes {topic}; start it with: bass-ros"
+            if ros_names.relative(topic, component.node).startswith("/"):  # that of another robot, or without one
+                what += f", or write {REQUEST.parameter('connect').default} for the bass beside {component.node}"
+            raise middleware_error(what)
         running = await bass.outputs("getAcquisition", {})
         if not running["running"]:
             await shield_until_done(_acquire(component, bass, values, topic, undo_steps))

@@ -320,7 +320,9 @@ def _open_output(part: AtomicOutput, options: argparse.Namespace, source: SoundS
         return WavFile(descriptor, source.sample_rate)
     # A published stream keeps its frame numbers and its name.
     chunk, newest = getattr(source, "frames_per_chunk", options.chunk), getattr(source, "newest", 0)
-    return BagWriter(descriptor, source.sample_rate, chunk, f"/{_TOPIC}" if options.device or options.socket else source.name, newest)
+    return BagWriter(
+        descriptor, source.sample_rate, chunk, f"/{_TOPIC}" if options.device or options.socket else source.name, newest
+    )
 
 
 def _summary(recorder: SoundRecorder, name: str, sample_rate: int) -> str:

@@ -105,7 +105,10 @@ def _parameter(setting: str) -> tuple[str, Any]:
 
 
 async def _send(instance: str, values: Mapping[str, Any], kind: Representation) -> tuple[str, Mapping[str, Any]]:
-    """Return the full name of the node, and the response as genomixd would. Raises CommandError, with the next step, if the request is refused."""
+    """Return the full name of the node, and the response as genomixd would.
+
+    Raises CommandError, with the next step, if the request is refused.
+    """
     async with component(instance) as client:
         try:
             existing = (await client.outputs("getProcessors", {}))["processors"]

@@ -40,7 +40,7 @@ LAUNCH = """<group ns="{name}">
 @pytest.fixture(scope="module")
 def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
     """Launch two robots, and run a genomixd outside of their namespaces. The names of files have blanks and quotes."""
-    folder = tmp_path_factory.mktemp("two") / "it's a \"robot\" \\ "
+    folder = tmp_path_factory.mktemp("two") / 'it\'s a "robot" \\ '
     folder.mkdir()
     ports = {name: free_port() for name in RATES}
     groups = []
@@ -52,15 +52,15 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace
         )
     launch = folder / "two.launch"
     launch.write_text(f"<launch>{''.join(groups)}</launch>")
-    with worlds.world(folder.parent, nodes=False) as outside:
-        with outside.graph.start("roslaunch", str(launch)) as process:
-            wait_for(
-                lambda: process.out.count("created  of_robot") == 2 or not process.alive, what=lambda: str(process)
-            )
-            inside = {name: World(outside.graph, outside.master, process, port) for name, port in ports.items()}
-            yield SimpleNamespace(outside=outside, graph=outside.graph, folder=folder, process=process, **inside)
-            assert process.stop(signal.SIGINT) == 0
-            assert "Traceback" not in process.out + process.err, process
+    with (
+        worlds.world(folder.parent, nodes=False) as outside,
+        outside.graph.start("roslaunch", str(launch)) as process,
+    ):
+        wait_for(lambda: process.out.count("created  of_robot") == 2 or not process.alive, what=lambda: str(process))
+        inside = {name: World(outside.graph, outside.master, process, port) for name, port in ports.items()}
+        yield SimpleNamespace(outside=outside, graph=outside.graph, folder=folder, **inside)
+        assert process.stop(signal.SIGINT) == 0
+        assert "Traceback" not in process.out + process.err, process
 
 
 def processors(http: Http, target: str, **query: Any) -> list[str]:
@@ -95,7 +95,7 @@ def test_instances_of_other_namespaces(robots: SimpleNamespace) -> None:
         assert (status, json.loads(body)["node"]) == (200, "/robot2/rosAFE"), body
     assert processors(first, "rosAFE", i="/robot2/rosAFE") == ["input", "of_robot2"]
     for path in ("rosAFE", "/opt/openrobots/lib/genom/ros/plugins/rosAFE", "robot3/rosAFE"):
-        with pytest.raises(worlds.HttpError, match="rosAFE is not running: /(robot3/)?rosAFE/"):
+        with pytest.raises(worlds.HttpError, match=r"rosAFE is not running: /(robot3/)?rosAFE/"):
             http.get(f"/load/{path}")
     for wrong in ("~rosAFE", "robot 1/rosAFE", "robot1//rosAFE", "1robot/rosAFE"):
         with pytest.raises(worlds.HttpError, match="expected the name of a component or instance"):
@@ -115,10 +115,22 @@ def test_tcl(robots: SimpleNamespace) -> None:
         show [dict get [robot1_rosAFE::preProcPort of_robot1] preProcPort sampleRate]
         show [lindex [failure {$g load rosAFE}] 1 0]
     """
-    lines = ["robot1_rosAFE|input of_robot1", "second|input of_robot2", "robot2_rosAFE|input of_robot2", "16000", "GENOM"]
+    lines = [
+        "robot1_rosAFE|input of_robot1",
+        "second|input of_robot2",
+        "robot2_rosAFE|input of_robot2",
+        "16000",
+        "GENOM",
+    ]
     assert robots.outside.lines(script) == lines
-    script = "set g [genomix::connect $address]\n$g load bass\n$g load rosAFE\nshow [dict get [bass::Audio] Audio sampleRate]"
-    assert robots.robot2.lines(script + "\nrosAFE::connect_port Audio bass/Audio") == ["8000"]
+    script = """
+        set g [genomix::connect $address]
+        $g load bass
+        $g load rosAFE
+        rosAFE::connect_port Audio bass/Audio
+        show [dict get [bass::Audio] Audio sampleRate]
+    """
+    assert robots.robot2.lines(script) == ["8000"]
 
 
 def test_octave(robots: SimpleNamespace, tmp_path: Path) -> None:
@@ -148,19 +160,22 @@ def test_octave(robots: SimpleNamespace, tmp_path: Path) -> None:
 @pytest.mark.parametrize("inside", [True, False])
 def test_commands(robots: SimpleNamespace, tmp_path: Path, inside: bool) -> None:
     graph: Graph = robots.graph
-    env, option = ({"ROS_NAMESPACE": "robot2"}, ()) if inside else ({}, ("-i", "robot2/rosAFE"))
-    done = graph.run("rosafe", "request", "ratemap", "fb_nChannels=2", *option, **env)
+    namespace, option = ("robot2", ()) if inside else ("", ("-i", "robot2/rosAFE"))
+    done = graph.run("rosafe", "request", "ratemap", "fb_nChannels=2", *option, ROS_NAMESPACE=namespace)
     assert "created  ratemap_0" in done.stdout and "/robot2/rosAFE/ratemapPort/ratemap_0" in done.stdout
-    done = graph.run("rosafe", "setup", "save", "-", *option, **env)
+    done = graph.run("rosafe", "setup", "save", "-", *option, ROS_NAMESPACE=namespace)
     assert "of_robot2" in done.stdout and "of_robot1" not in done.stdout
     setup = tmp_path / "setup.yaml"
     setup.write_text(done.stdout + "localizer: {seconds: 0.25}\n")
-    assert "reused   of_robot2" in graph.run("rosafe", "setup", "load", str(setup), *option, **env).stdout
+    assert (
+        "reused   of_robot2"
+        in graph.run("rosafe", "setup", "load", str(setup), *option, ROS_NAMESPACE=namespace).stdout
+    )
     assert graph.run("rosparam", "get", "/robot2/localizer/seconds").stdout.strip() == "0.25"
     robots.robot2.http.call("rosAFE/removeProcessor", {"name": "filterbank_0"})
     sound = tmp_path / "sound.wav"
     topic = () if inside else ("--topic", "robot2/bass/Audio")
-    graph.run("rosafe", "record", str(sound), "--seconds", "0.5", *topic, **env)
+    graph.run("rosafe", "record", str(sound), "--seconds", "0.5", *topic, ROS_NAMESPACE=namespace)
     assert soundfile.info(str(sound)).samplerate == 8000
     done = graph.run("rosafe", "request", "ild", "-i", "robot3/rosAFE", check=False)
     assert "robot3/rosAFE is not running" in done.stderr

@@ -210,7 +210,7 @@ def test_topics_that_are_no_messages_are_no_ports(tmp_path: Path, monkeypatch: p
     arm = installed_components.describe("arm")
     kinds = ["arm/__name__", "arm/_arm_point", "arm/__dict__", "arm/", "/", "*", "arm/x/y"]
     topics = {f"/left/{number}": kind for number, kind in enumerate(kinds)}
-    assert installed_components.with_ports(arm, "left", topics | {"/left/a": "arm/arm_point"}).ports == (
+    assert installed_components.with_ports(arm, "/left", topics | {"/left/a": "arm/arm_point"}).ports == (
         *arm.ports,
         interface.PortSpec("a", "::arm::arm_point", ""),
     )

@@ -269,6 +269,6 @@ def test_the_formats_are_those_of_the_protocol() -> None:
 def test_images_wait_for_an_output_that_is_not_available(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its frame rate is unknown before the audio starts."""
     monkeypatch.setattr(rospy, "Publisher", lambda *_, **__: SimpleNamespace(get_num_connections=lambda: 1))
-    hub = Hub("bass", lambda: None)
+    hub = Hub("/bass", "/localizer", lambda: None)
     hub.tree = tree(processor("ratemap", 0.0, (2, 3)))
     image_topics.Images(hub).publish()

@@ -250,7 +250,7 @@ def columns(monkeypatch: pytest.MonkeyPatch) -> tuple[directions.DirectionTopics
     audio = SimpleNamespace(time_at=lambda moment: moment, sample_rate=16000)
     found: list[tuple[int, int]] = []
     append = lambda number, column, _: found.append((number, column.shape[1]))  # noqa: E731
-    return directions.DirectionTopics(lambda: cast(Any, audio), append, "bass"), found
+    return directions.DirectionTopics(lambda: cast(Any, audio), append, "/bass", "/localizer"), found
 
 
 def pair(moment: float) -> tuple[Any, Any]:

@@ -61,9 +61,7 @@ def test_repeated_messages_have_no_new_frames(graph: Graph) -> None:
 
 
 @pytest.mark.exploration
-def test_a_clock_that_stands_is_logged_rarely(
-    tmp_path: Path, talker: Path, sphere_model: Path
-) -> None:
+def test_a_clock_that_stands_is_logged_rarely(tmp_path: Path, talker: Path, sphere_model: Path) -> None:
     device = scene_file(tmp_path, SCENE.format(rate=RATE, file=talker))
     with private_graph(tmp_path / "home") as (graph, _):
         graph.run("rosparam", "set", "/use_sim_time", "true")
@@ -75,7 +73,9 @@ def test_a_clock_that_stands_is_logged_rarely(
             watcher(graph) as seen,
         ):
             graph.run("rosservice", "call", "/bass/Acquire", f"{{device: '{device}'}}")
-            wait_for(lambda: "the time of the frames jumped" in localizer.process.err, what=lambda: str(localizer.process))
+            wait_for(
+                lambda: "the time of the frames jumped" in localizer.process.err, what=lambda: str(localizer.process)
+            )
             count = len(watched(seen))
             wait_for(lambda: len(watched(seen)) > count + 50, what=lambda: str(localizer.process))
             lines = [line for line in localizer.process.err.splitlines() if "the time of the frames jumped" in line]

@@ -39,4 +39,6 @@ def test_env_names_the_path(tmp_path: Path, folder: str, shell: str) -> None:
     line = f". {shlex.quote(str(checkout(tmp_path, folder) / 'env.sh'))} || echo refused"
     done = run(shell, "-c", line, env=environment())
     assert done.stdout == "refused\n"
-    assert done.stderr.startswith(f"rosafe: checkout: {EXPECTED}{tmp_path}/") and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith(f"rosafe: checkout: {EXPECTED}{tmp_path}/") and done.stderr.count("\n") == 1, (
+        done.stderr
+    )

@@ -263,7 +263,9 @@ def test_uninstall_with_an_argument_removes_nothing(tmp_path: Path, argument: st
     assert all(folder.exists() for folder in removed)
 
 
-@pytest.mark.parametrize("name", sorted({p.name for p in SCRIPTS.iterdir()} - {"env.sh", "checkout.sh", "install", "uninstall"}))
+@pytest.mark.parametrize(
+    "name", sorted({p.name for p in SCRIPTS.iterdir()} - {"env.sh", "checkout.sh", "install", "uninstall"})
+)
 def test_help_of_every_script_has_an_example(name: str) -> None:
     done = run(SCRIPTS / name, "-h", env=environment())
     assert (done.returncode, done.stderr) == (0, "")

@@ -146,7 +146,7 @@ def test_a_failure_is_an_error_with_the_names_of_the_children(world: worlds.Worl
     text = log(world)
     assert text.count("Traceback") - before == 1
     assert len(re.findall(r"\[ERROR\].*first \(breaks\) failed", text)) == 1
-    page = Health("rosAFE", "bass")
+    page = Health("/rosAFE", "/bass", "/localizer")
     page._subscriber = object()
     page._receive(DiagnosticArray(status=[status]))
     assert reported in page.status()["failures"]

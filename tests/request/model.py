@@ -31,7 +31,7 @@ class Model:
     """A component with its processors by name and the calls it got; the call number `fail` fails."""
 
     def __init__(self, audio: bool = True, sample_rate: float = RATE) -> None:
-        self.instance = "rosAFE"
+        self.node = "/rosAFE"
         self.turns = Turns()
         self.sample_rate = sample_rate
         self.processors: dict[str, Processor] = {}

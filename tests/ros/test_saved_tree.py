@@ -24,6 +24,7 @@ from rosafe.interface import ComponentError, Service
 from rosafe.node.audio_input import AudioInput
 from rosafe.node.saved_tree import SavedTree
 from rosafe.setups import read
+from rosafe.transport import registration
 from rosafe.tree.tree import Tree
 from tests.harness import PATIENCE, Graph, MasterProcess, wait_for
 from tests.ros.session import Microphone, Session, noise, own_node

@@ -36,7 +36,7 @@ processors:
 def test_a_setup_written_by_hand() -> None:
     setup = read(TREE)
     assert setup.sound == AcquireSettings({"device": "scene:"})
-    assert setup.connections == {"Audio": "/bass/Audio"}
+    assert setup.connections == {"Audio": "bass/Audio"}
     assert [(w.name, w.kind, w.parent, dict(w.explicit)) for w in setup.processors] == [
         ("input", "input", "", {"nFramesPerBlock": 4410}),
         ("time", "preProc", "input", {}),

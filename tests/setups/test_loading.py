@@ -33,7 +33,7 @@ class Bass:
     """The services of bass that setups use."""
 
     component = BASS
-    instance = "bass"
+    node = "/bass"
 
     def __init__(self) -> None:
         self.acquired: dict[str, Any] = {}
@@ -57,8 +57,8 @@ class Graph(Model):
         self.bass = Bass()
 
     @asynccontextmanager
-    async def other(self, instance: str) -> AsyncIterator[Any]:
-        if instance != "bass":
+    async def other(self, node: str) -> AsyncIterator[Any]:
+        if node != "/bass":
             raise ComponentError("::genom::mwerr", what="not running")
         yield self.bass
 
