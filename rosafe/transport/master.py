@@ -30,8 +30,8 @@ def set_local_defaults(environ: MutableMapping[str, str] = os.environ) -> None:
     """Set ROS variables that are unset or empty, so that ROS works on this machine alone.
 
     The address is 127.0.0.1 because rospy waits forever for `localhost` on a machine without /etc/hosts. ROS_IP is not
-    set if the master is on another host, which could not call back to loopback, or with ROS_IPV6=on. Empty variables are
-    removed because rospy logs a warning about them repeatedly.
+    set if the master is on another host, which could not call back to loopback, or with ROS_IPV6=on. Empty variables
+    are removed because rospy logs a warning about them repeatedly.
     """
     for variable in ("ROS_HOSTNAME", "ROS_IP"):
         if environ.get(variable) == "":
