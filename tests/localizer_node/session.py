@@ -89,14 +89,14 @@ from rosAFE.msg import SoundSources
 def show(m):
     print(m.header.stamp.to_sec(), *(math.degrees(s.azimuth) for s in m.sources if s.probability > 0.5), flush=True)
 rospy.init_node("watcher", anonymous=True)
-rospy.Subscriber("/localizer/sources", SoundSources, show)
+rospy.Subscriber("localizer/sources", SoundSources, show)
 rospy.spin()
 """
 
 
-def watcher(graph: Graph) -> Process:
-    """Start a process that prints the messages on /localizer/sources of a private graph."""
-    return graph.start(PYTHON, "-c", WATCHER)
+def watcher(graph: Graph, namespace: str = "/") -> Process:
+    """Start a process that prints the messages on localizer/sources of a private graph."""
+    return graph.start(PYTHON, "-c", WATCHER, ROS_NAMESPACE=namespace)
 
 
 def watched(process: Process) -> list[list[float]]:

@@ -20,19 +20,21 @@ processors:
 
 
 @pytest.mark.exploration
-def test_roslaunch_localizes(tmp_path: Path, talker: Path, sphere_model: Path) -> None:
+@pytest.mark.parametrize("namespace", ["/", "/robot/"])
+def test_roslaunch_localizes(tmp_path: Path, talker: Path, sphere_model: Path, namespace: str) -> None:
     graph = Graph(f"http://127.0.0.1:{free_port()}", tmp_path)
     scene, setup = tmp_path / "scene.yaml", tmp_path / "tree.yaml"
     scene.write_text(SCENE.format(rate=RATE, file=talker))
     setup.write_text(SETUP.format(scene=scene))
     arguments = (f"setup:={setup}", "localize:=true", f"head:={sphere_model}", f"port:={free_port()}")
-    with graph.start("roslaunch", "rosAFE", "rosafe.launch", *arguments) as launch:
+    with graph.start("roslaunch", "rosAFE", "rosafe.launch", *arguments, ROS_NAMESPACE=namespace) as launch:
         wait_for(lambda: "localizing with" in launch.out + launch.err, what=lambda: f"the localizer: {launch}")
-        with watcher(graph) as seen:
+        with watcher(graph, namespace) as seen:
             wait_for(
                 lambda: any(abs(azimuth + 50) < 10 for line in watched(seen) for azimuth in line[1:]),
                 what=lambda: seen.out,
             )
-        assert {"/bass", "/rosAFE", "/genomixd", "/localizer"} <= graph.nodes()
+        nodes = {f"{namespace}{name}" for name in ("bass", "rosAFE", "genomixd", "localizer")}
+        assert nodes <= graph.nodes()
         assert launch.stop(signal.SIGINT) == 0
     assert "Traceback" not in launch.out + launch.err, launch
