@@ -399,7 +399,7 @@ async def names(graph: Graph, component: str, instance: str) -> tuple[str, str]:
     Parameters
     ----------
     graph : Graph
-        Its namespace is that of relative names, and of the component if there is no instance.
+        Relative names are in its namespace.
     component : str
         Name of the component or instance, or the path of a GenoM plugin (``/opt/lib/rosAFE.so``, also without the
         suffix), whose file name counts.

@@ -155,7 +155,7 @@ async def _sound(
     async with _bass(component, topic) as bass:
         if bass is None:
             what = f"the setup has a sound, but no bass publishes {topic}; start it with: bass-ros"
-            if ros_names.relative(topic, component.node).startswith("/"):  # that of another robot, or without one
+            if ros_names.relative(topic, component.node).startswith("/"):  # in another namespace
                 what += f", or write {REQUEST.parameter('connect').default} for the bass beside {component.node}"
             raise middleware_error(what)
         running = await bass.outputs("getAcquisition", {})

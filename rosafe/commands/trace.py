@@ -68,7 +68,9 @@ def run(options: argparse.Namespace) -> int:
         if options.sound is not None:
             title, events = printable(options.sound), _compute(options.sound, options.seconds, options.block)
         else:
-            title = f"/{options.node.strip('/')}"
+            from rosgraph.names import get_ros_namespace, ns_join
+
+            title = ns_join(get_ros_namespace(), options.node.rstrip("/"))
             if not re.fullmatch(r"(/[A-Za-z]\w*)+", title, re.ASCII):
                 raise CommandError(f"--node: expected the name of a node, such as rosAFE, got {options.node!r}")
             events = _listen(title, options.seconds)

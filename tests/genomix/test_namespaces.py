@@ -173,6 +173,8 @@ def test_commands(robots: SimpleNamespace, tmp_path: Path, inside: bool) -> None
     )
     assert graph.run("rosparam", "get", "/robot2/localizer/seconds").stdout.strip() == "0.25"
     robots.robot2.http.call("rosAFE/removeProcessor", {"name": "filterbank_0"})
+    target = () if inside else ("--node", "robot2/rosAFE")
+    assert "of_robot2" in graph.run("rosafe", "trace", "--seconds", "1", *target, ROS_NAMESPACE=namespace).stdout
     sound = tmp_path / "sound.wav"
     topic = () if inside else ("--topic", "robot2/bass/Audio")
     graph.run("rosafe", "record", str(sound), "--seconds", "0.5", *topic, ROS_NAMESPACE=namespace)
