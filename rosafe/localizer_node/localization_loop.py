@@ -168,9 +168,8 @@ class LocalizationLoop:
         middles = used.frames.middles
         steps = np.diff(middles, prepend=self._newest or middles[0])
         if steps.min() < -TIME_SLACK or steps.max() > MAX_PAUSE:
-            jump = steps[np.abs(steps).argmax()]
-            why = "; is /clock published, and does it advance?" if jump < 0 else ""
-            _report(f"the time of the frames jumped by {jump:.3f} s{why}; localization begins again", "time")
+            jump = f"{steps[np.abs(steps).argmax()]:.3f} s"
+            _report(f"the time jumped by {jump}; localization begins again; with use_sim_time, check /clock", "time")
             self._begin_again()
             return False
         middles = np.maximum.accumulate(middles)

@@ -143,7 +143,7 @@ def test_octave(robots: SimpleNamespace, tmp_path: Path) -> None:
         show('first', names(first));
         show('second', names(second));
         bass.Stop();
-        request = rosafe.acquire(bass, second, 8000, 1, 8000, 'scene:');
+        request = acquireAudio(bass, second, 8000, 1, 8000, 'scene:');
         show('status', request.status);
         show('rate', bass.getAcquisition().result.sampleRate);
     """
