@@ -31,7 +31,9 @@ def build(folder: Path, **variables: str) -> dict[str, Path]:
     if missing:
         pytest.skip(f"not installed: {missing}; run scripts/install --tests")
     with fresh_copy() as copy:
-        env = environment(SOURCE_DATE_EPOCH=DATE, **variables)
+        temporary = folder.parent / "temporary 'files'"  # debhelper cannot build in such a folder
+        temporary.mkdir(exist_ok=True)
+        env = environment(SOURCE_DATE_EPOCH=DATE, TMPDIR=str(temporary), **variables)
         done = run(copy / "scripts" / "make-deb", folder, env=env, seconds=500)
     if "cannot download" in done.stderr:
         pytest.skip(done.stderr)
