@@ -78,19 +78,23 @@ def read_settings(options: Mapping[str, Any], node: str = "~") -> LocalizerSetti
         if given is None and setting.name != "parameters":
             given = rospy.get_param(f"{node}{setting.name}", None)
         if given is not None:
-            values[setting.name] = _check(setting.name, given)
+            values[setting.name] = (
+                _check(setting.name, given) if setting.name != "mirror" else _flag(setting.name, given)
+            )
     settings = LocalizerSettings(**values)
     if settings.world_frame == settings.head_frame:
         raise ValueError(f"world_frame: expected another frame than head_frame, got {settings.world_frame!r}")
     return settings
 
 
+def _flag(name: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"{name}: expected true or false, got {short_repr(value)}")
+    return value
+
+
 def _check(name: str, value: Any) -> Any:
     if name == "parameters":
-        return value
-    if name == "mirror":
-        if not isinstance(value, bool):
-            raise ValueError(f"mirror: expected true or false, got {short_repr(value)}")
         return value
     if name in ("seconds", "audio_delay"):
         low, high = (0.01, MAX_SECONDS) if name == "seconds" else (-MAX_AUDIO_DELAY, MAX_AUDIO_DELAY)

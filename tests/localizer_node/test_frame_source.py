@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -12,6 +13,7 @@ import pytest
 import rospy
 
 from rosafe.localization import cues
+from rosafe.localizer_node import frame_source
 from rosafe.localizer_node.frame_source import FrameFormat, FrameSource, StreamRestartedError
 from rosafe.ros import FrameClock, array_msg
 from tests.harness import Graph, private_graph, wait_for
@@ -56,6 +58,23 @@ def test_repeated_messages_have_no_new_frames(graph: Graph) -> None:
         source.close()
         for publisher in publishers:
             publisher.unregister()
+
+
+def test_messages_of_an_earlier_stream_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    receive: list[Any] = []
+    monkeypatch.setattr(rospy, "Subscriber", lambda topic, kind, callback, **_: receive.append(callback))
+    source: Any = SimpleNamespace(lock=threading.Lock(), is_ready=lambda: False)
+    port = frame_source._Port("/rosAFE/ildPort/ild", "ild", FrameFormat(16000, 4, 320, 160, 1000), source)
+
+    def send(index: int) -> None:
+        receive[0](SimpleNamespace(data=frame_source._HEAD.pack(0, index, 10)))
+
+    for index in (1000, 2000, 3000):
+        send(index)
+    assert [*port.messages] == [1000, 2000, 3000]
+    send(500)  # the sound has begun again
+    send(1500)
+    assert [*port.messages] == [500, 1500]
 
 
 @pytest.mark.exploration
