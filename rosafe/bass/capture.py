@@ -11,7 +11,7 @@ import numpy as np
 
 from rosafe import interface
 from rosafe.bass.sources import SoundSource
-from rosafe.bass.sources.base import hwparams_error, loss_text, wall_time_ns
+from rosafe.bass.sources.base import hwparams_error, loss_text, take_remarks, wall_time_ns
 from rosafe.sound.windows import MAX_WINDOW
 
 LATE_CHUNKS = 2  # if capture is later than this, chunks are published together
@@ -131,6 +131,8 @@ class Capture:
             if lost:
                 known_lost += lost
                 self._report(loss_text(lost, self.last_frame_index, self.source.sample_rate))
+            for text in take_remarks(self.source):
+                self._report(text)
             self._window.skip(chunk.gap)
             self._window.append(chunk.samples)
             new = chunk.gap + chunk.samples.shape[1]

@@ -132,7 +132,7 @@ def _result(path: Path, settings: list[str]) -> Mapping[str, Any]:
 
 def _sound(path: Path, clip: bool) -> tuple[np.ndarray, int]:
     """Return the sound, (ears, N) with one or two ears, and its sample rate in Hz."""
-    from rosafe.offline.sounds import BAG, open_sound
+    from rosafe.offline.sounds import BAG, open_sound, read_whole
     from rosafe.sound.audiofile import AudioFile, AudioFileError
 
     with contextlib.closing(open_sound(path) if path.suffix.lower() == BAG else AudioFile(path, clip)) as file:
@@ -141,7 +141,7 @@ def _sound(path: Path, clip: bool) -> tuple[np.ndarray, int]:
                 f"{path}: expected one or two channels, got {file.channels}; "
                 "draw the result of rosafe process --channels A,B instead"
             )
-        sound = file.read(file.frames)
+        sound = read_whole(file)
         if file.clipped:
             print(f"rosafe plot: {path}: {clipping_warning(file.clipped)}", file=sys.stderr)
         return sound, file.sample_rate

@@ -407,7 +407,9 @@ class _Corpus:
             self._done += 1
             self._seconds += done.seconds
             self._size += done.size
-            self._warnings += done.not_finite > 0
+            self._warnings += done.not_finite > 0 or bool(done.remark)
+            if done.remark:
+                self.display.message(f"rosafe process: {done.remark}")
             if done.clipped:
                 self.display.message(f"rosafe process: {source}: {clipping_warning(done.clipped)}")
             if done.empty:

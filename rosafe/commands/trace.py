@@ -103,6 +103,8 @@ def _compute(path: Path, seconds: float, block: int) -> list[Event]:
         try:
             if sound.channels != 2:
                 raise CommandError(f"{path}: expected two channels, left and right ear, got {sound.channels}")
+            if sound.remark:
+                print(f"rosafe trace: {printable(sound.remark)}", file=sys.stderr)
             frames = min(sound.frames, math.ceil(seconds * sound.sample_rate))
             blocks = (sound.read(min(block, frames - first)) for first in range(0, frames, block))
             values = {"in_doNormalize": True, **check_parameters(None)}

@@ -61,7 +61,7 @@ def localize(
     Warns
     -----
     UserWarning
-        If samples are clipped, with their number.
+        If samples are clipped, with their number, and if floats are in the range of integer samples.
 
     Notes
     -----

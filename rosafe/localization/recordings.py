@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -61,6 +62,10 @@ def learn_recordings(
                 )
             frames = min(reader.frames, round(MAX_SECONDS * sample_rate))
             sounds.setdefault(round(float(angles.wrap(azimuth)), 3), []).append(reader.read(frames) / 2.0**31)
+            if reader.not_finite:
+                raise ValueError(f"{printable(file)}: expected finite samples, got {reader.not_finite} others")
+            if reader.remark:
+                warnings.warn(reader.remark, UserWarning, stacklevel=2)
     assert sample_rate is not None
     recorded = {azimuth: _normalized(np.concatenate(parts, axis=1)) for azimuth, parts in sorted(sounds.items())}
     _check(recorded, sample_rate, printable(os.fspath(path)))

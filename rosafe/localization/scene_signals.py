@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from fractions import Fraction
 from typing import Protocol
@@ -15,6 +16,8 @@ from rosafe.sound.audiofile import AudioFile, AudioFileError
 
 ENDLESS = 2**62  # frames
 MAX_FILE_FRAMES = 2**25  # of one sound file
+MAX_RATIO = 2**18  # terms of the ratio of two sample rates; the filter has 20 times as many coefficients
+_BLOCK = 2**12  # frames of up to 1024 channels
 _RAMP_SECONDS = 0.005  # at the beginning of a noise, tone or vowel
 _FORMANTS = ((730.0, 90.0), (1090.0, 110.0), (2440.0, 170.0))  # Hz, of /a/: frequency and bandwidth
 
@@ -32,17 +35,29 @@ class FileSignal:
     """The mean of the channels of a sound file, resampled to the rate of the scene and scaled to an RMS of 1."""
 
     def __init__(self, path: str | os.PathLike[str], sample_rate: int, loop: bool) -> None:
-        with contextlib.closing(AudioFile(os.fspath(path))) as file:
-            if file.frames * max(1.0, sample_rate / file.sample_rate) > MAX_FILE_FRAMES:
-                raise AudioFileError(f"{path}: expected at most {MAX_FILE_FRAMES} frames, got {file.frames}")
-            samples = file.read(file.frames).mean(axis=0)
+        with contextlib.closing(AudioFile(os.fspath(path), clip=False)) as file:
             ratio = Fraction(sample_rate, file.sample_rate)
+            if max(ratio.numerator, ratio.denominator) > MAX_RATIO:
+                raise AudioFileError(
+                    f"{path}: expected a sample rate whose ratio to {sample_rate} Hz has terms of at most {MAX_RATIO}, "
+                    f"got {file.sample_rate} Hz; convert it: `ffmpeg -i IN -ar {sample_rate} OUT.wav`"
+                )
+            if file.frames * max(1.0, float(ratio)) > MAX_FILE_FRAMES:
+                raise AudioFileError(
+                    f"{path}: expected at most {MAX_FILE_FRAMES} frames (as stored and at {sample_rate} Hz), "
+                    f"got {file.frames} at {file.sample_rate} Hz"
+                )
+            samples = _mean(file)
         if ratio != 1:
             samples = scipy.signal.resample_poly(samples, ratio.numerator, ratio.denominator)
-        power = float(np.sqrt(np.mean(samples**2)))
+        with np.errstate(over="ignore"):
+            power = math.sqrt(float(np.dot(samples, samples)) / len(samples))
         if not power > 0:
             raise AudioFileError(f"{path}: expected a sound, got silence")
-        self._samples = (samples / power).astype(np.float32)
+        if not power < math.inf:
+            raise AudioFileError(f"{path}: expected samples of at most 1e150, got larger ones")
+        samples /= power
+        self._samples = samples.astype(np.float32)
         self.stored = len(samples)
         self.frames = ENDLESS if loop else len(samples)
 
@@ -55,6 +70,21 @@ class FileSignal:
         available = self._samples[begin : begin + count]
         part[: len(available)] = available
         return part
+
+
+def _mean(file: AudioFile) -> FloatArray:
+    """Return the mean of the channels. AudioFileError if something is missing."""
+    mean = np.empty(file.frames)
+    for begin in range(0, file.frames, _BLOCK):
+        block = file.read(min(_BLOCK, file.frames - begin))
+        if begin + block.shape[1] < min(begin + _BLOCK, file.frames):
+            raise AudioFileError(f"{file.path}: expected {file.frames} frames, got fewer; the file is truncated")
+        np.mean(block, axis=0, out=mean[begin : begin + block.shape[1]])
+    if file.not_finite:
+        raise AudioFileError(f"{file.path}: expected finite samples, got {file.not_finite} others")
+    if file.remark:
+        raise AudioFileError(file.remark)
+    return mean
 
 
 class NoiseSignal:

@@ -41,6 +41,7 @@ class FileResult(NamedTuple):
     not_finite: int = 0  # NaN or infinite samples
     clipped: int = 0  # samples that were limited to full scale
     empty: tuple[str, ...] = ()  # outputs without frames
+    remark: str = ""  # one line about sound that was not read
 
 
 def process_file(
@@ -122,7 +123,8 @@ def process_file(
         with new_output(file_format, target, replace) as path:
             empty = _FileRun(sound, path, file_format, about, values, kinds, progress).run()
             size = sum(part.stat().st_size for part in path.rglob("*")) if file_format.folder else path.stat().st_size
-        return FileResult(sound.frames / sound.sample_rate, size, False, sound.not_finite, sound.clipped, empty)
+        seconds = sound.frames / sound.sample_rate
+        return FileResult(seconds, size, False, sound.not_finite, sound.clipped, empty, sound.remark)
 
 
 def _options_of(

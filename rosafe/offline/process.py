@@ -23,7 +23,7 @@ from rosafe.offline.chain import Chain, FrameLimiter, computed_ears, effective_p
 from rosafe.offline.collector import OutputCollector, allocate_branches, join_branches
 from rosafe.offline.memory import refuse_over_available
 from rosafe.offline.result import Result
-from rosafe.offline.signals import as_samples, check_finite, ears_view, frame_times, of_ears, outputs_of
+from rosafe.offline.signals import as_samples, check_finite, ears_view, frame_times, of_ears, outputs_of, range_warning
 from rosafe.tree.block import Block
 from rosafe.tree.workers import workers_to_use
 from rosafe.version import VERSION
@@ -94,8 +94,8 @@ def process(
     Warns
     -----
     UserWarning
-        If an output has no frames because the signal is shorter than its window, and if the window of the pitch is
-        shorter than three periods of the lowest pitch.
+        If an output has no frames because the signal is shorter than its window, if the window of the pitch is shorter
+        than three periods of the lowest pitch, and if floats are in the range of integer samples.
 
     See Also
     --------
@@ -143,9 +143,9 @@ def _merge_positional(positional: tuple[Any, ...], options: tuple[Any, Any, Any,
 
 
 class ProcessCall:
-    """One call of `process` with checked arguments. Nothing is computed before `run`, which sets `warnings`."""
+    """One call of `process` with checked arguments. Nothing is computed before `run`, which completes `warnings`."""
 
-    warnings: Sequence[str] = ()
+    warnings: list[str]
 
     def __init__(
         self,
@@ -182,6 +182,7 @@ class ProcessCall:
         try:
             self._prepare(frames, lengths, changes, padded)
             check_finite(view)  # last, because it reads the whole signal
+            self.warnings = list(filter(None, [range_warning(view)]))
         except BaseException:
             self.chain.close()
             raise
@@ -267,7 +268,7 @@ class ProcessCall:
             results |= self.chain.describe()
         result = Result(results, parameters=parameters, sample_rate=self.rate, version=VERSION)
         framed = [kind for kind in self.outputs if f"{kind}_frameRate" in result]
-        self.warnings = warnings_of(parameters, self.outputs)
+        self.warnings += warnings_of(parameters, self.outputs)
         if empty := [kind for kind in framed if not len(result[f"{kind}_time"])]:
             self.warnings.append(no_frames(empty, not self.frames, "pad=True"))
         return result

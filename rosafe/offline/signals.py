@@ -12,6 +12,7 @@ from rosafe.interface import CORE_REPRESENTATIONS, KINDS
 from rosafe.interface.arguments import check_outputs
 
 _CHECK_FRAMES = 2**18  # checked at a time, so that no large array is allocated
+_MAX_FLOAT = 256.0  # larger floats look like integer samples
 _SHAPES = "shape (N,) or (1, N) for one ear, (2, N) or (N, 2) for two"
 
 
@@ -73,6 +74,16 @@ def check_finite(ears: np.ndarray) -> None:
                 raise ValueError("signal: expected finite samples, got NaN or infinite ones")
 
 
+def range_warning(ears: np.ndarray) -> str:
+    """Return a warning if a signal as of `ears_view` has floats in the range of integer samples; '' if not."""
+    if ears.dtype.kind != "f" or not ears.size:
+        return ""
+    peak = max(float(ears.max()), -float(ears.min()))
+    if not _MAX_FLOAT < peak <= 2.0**31:
+        return ""
+    return f"signal: floats up to {peak:g}, but their full scale is 1; divide samples of int16 by 32768"
+
+
 def is_frames_first(signal: np.ndarray, frames_first: bool = False) -> bool:
     """Return whether `ears_view` reads a signal of two axes as (N, 2)."""
     return signal.shape[1] == 2 and (signal.shape[0] not in (1, 2) or (frames_first and len(signal) == 2))
@@ -87,9 +98,13 @@ class BlockReader:
         1 or 2; 0 before the first block.
     whole : bool
         Whether the samples are integers.
+    warning : str
+        That of `range_warning` about the block that was accepted last, once; '' otherwise.
     """
 
     def __init__(self) -> None:
+        self.warning = ""
+        self._warned = False
         self.ears = 0
         self.whole = False
         self._frames_first = False
@@ -110,6 +125,8 @@ class BlockReader:
         """Remember the format of a block that has been checked completely."""
         shape = np.shape(block)
         self.ears, self.whole = len(view), view.dtype.kind == "i"
+        self.warning = "" if self._warned else range_warning(view)
+        self._warned |= bool(self.warning)
         if len(shape) == 2 and shape != (2, 2):
             self._frames_first = is_frames_first(np.asarray(block)) or shape == (1, 2)
 

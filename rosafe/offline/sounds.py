@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
+import warnings
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -13,8 +14,9 @@ from typing import Protocol
 import numpy as np
 
 from rosafe.offline.memory import check_arrays
-from rosafe.sound.audiofile import AudioFile, AudioFileError, channels_text
+from rosafe.sound.audiofile import NOT_FINITE, AudioFile, AudioFileError, channels_text
 from rosafe.sound.bagsound import BagSoundError, Recording, from_first_samples
+from rosafe.tree.sizes import MAX_BYTES, check_memory
 
 BAG = ".bag"
 DEFAULT_TOPIC = "/bass/Audio"
@@ -39,6 +41,7 @@ class SoundReader(Protocol):
     floats: bool  # whether `read` returns float64
     not_finite: int  # number of NaN or infinite samples so far
     clipped: int  # number of samples so far that were limited to full scale
+    remark: str  # one line about sound that is not read, or ''
 
     def read(self, frames: int) -> np.ndarray:
         """Return the next `frames` frames, int32 or float64 (channels, n); fewer at the end."""
@@ -96,18 +99,34 @@ def open_sound(
 def read_ears(path: str | Path, channels: tuple[int, int] | None = None) -> tuple[np.ndarray, int]:
     """Return the sound of both ears (2, N) in a file or a bag, and its sample rate; AudioFileError as `open_sound`."""
     with contextlib.closing(open_sound(path, channels)) as file:
+        return read_whole(file), file.sample_rate
+
+
+def read_whole(file: SoundReader) -> np.ndarray:
+    """Return a whole sound, int32 or float64 (channels, frames), with a UserWarning for each remark about it.
+
+    AudioFileError if it is too long for the memory, or damaged.
+    """
+    size = file.frames * file.channels * (8 if file.floats else 4)
+    try:
         if isinstance(file, BagSound):  # its sound can be compressed to almost nothing
-            try:
-                check_arrays(0, os.path.getsize(file.path), 8 * file.frames)
-            except (OSError, ValueError) as problem:
-                raise AudioFileError(f"{file.path}: {problem}") from None
-        return file.read(file.frames), file.sample_rate
+            check_arrays(0, os.path.getsize(file.path), size)
+        check_memory(str(file.path), MAX_BYTES, size, "choose a part, as by `ffmpeg -ss 0 -t 600 -i IN OUT.wav`")
+    except (OSError, ValueError) as problem:
+        raise AudioFileError(f"{file.path}: {problem}" if isinstance(file, BagSound) else str(problem)) from None
+    sound = file.read(file.frames)
+    if sound.shape[1] != file.frames:
+        raise AudioFileError(f"{file.path}: expected {file.frames} frames, got {sound.shape[1]}; the file is truncated")
+    replaced = f"{file.path}: {file.not_finite} {NOT_FINITE}" if file.not_finite else ""
+    for text in filter(None, (file.remark, replaced)):
+        warnings.warn(text, UserWarning, stacklevel=2)
+    return sound
 
 
 class BagSound:
     """The stream of sound in a bag. Frames that were lost while it was recorded are replaced by silence."""
 
-    channels, floats, not_finite, clipped = 2, False, 0, 0
+    channels, floats, not_finite, clipped, remark = 2, False, 0, 0, ""
 
     def __init__(self, path: str | Path, topic: str | None, channels: tuple[int, int] | None) -> None:
         self.path = Path(path)

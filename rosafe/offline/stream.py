@@ -144,6 +144,8 @@ class Stream(OwnState):
             samples = self._accept(block)
         except ValueError as problem:
             raise problem.with_traceback(None) from None
+        if self._reader.warning:
+            warnings.warn(self._reader.warning, UserWarning, stacklevel=2)
         self._length += samples.shape[1]
         return self._compute(samples)
 

@@ -168,7 +168,7 @@ def bad_files(tmp_path: Path) -> Path:
         ("empty.wav", "e_device", "expected a sound file, got an empty file"),
         ("nothing.wav", "e_device", "expected samples, got none"),
         ("text.wav", "e_device", "expected a sound file, got another file"),
-        ("header.wav", "e_device", "expected a sound file, got another file"),
+        ("header.wav", "e_device", "expected a chunk of sound, got none; the file is truncated"),
         ("cut.wav", "e_device", "truncated"),
         ("cut.flac", "e_device", "truncated"),
         ("x" * 4000, "e_device", "too long"),

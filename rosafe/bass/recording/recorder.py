@@ -10,7 +10,7 @@ import numpy as np
 from rosafe.bass.recording.levels import LevelMeter
 from rosafe.bass.recording.outputs import Output
 from rosafe.bass.sources import SoundSource
-from rosafe.bass.sources.base import loss_text, wall_time_ns
+from rosafe.bass.sources.base import loss_text, take_remarks, wall_time_ns
 
 
 class SoundRecorder:
@@ -27,7 +27,7 @@ class SoundRecorder:
     show : callable
         Called with each piece of sound, int32 (2, n), and the number of frames lost so far.
     report : callable
-        Called with a line about each loss.
+        Called with a line about each loss, and about sound that the source replaces or does not read.
 
     Attributes
     ----------
@@ -87,3 +87,5 @@ class SoundRecorder:
         if lost > 0:
             self.lost += lost
             self._report(loss_text(lost, self.frames, self._source.sample_rate))
+        for text in take_remarks(self._source):
+            self._report(text)

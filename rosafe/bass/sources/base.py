@@ -56,6 +56,14 @@ class SoundSource(Protocol):
         """Release the device; `read` must not be called afterwards."""
 
 
+def take_remarks(source: SoundSource) -> list[str]:
+    """Return lines for the log about the sound of a source, each once."""
+    remarks: list[str] = getattr(source, "remarks", [])
+    taken = remarks[:]
+    remarks.clear()
+    return taken
+
+
 def device_error(why: str) -> ComponentError:
     """Return ``::bass::e_device``: the device is missing, busy, unreadable or lost."""
     return interface.BASS.error("e_device", why)
@@ -191,6 +199,7 @@ class PacedSource:
         self.sample_rate = 0
         self.overruns = 0
         self.lost_frames = 0
+        self.remarks: list[str] = []  # that `take_remarks` has not returned yet
         self._stopping = stopping
 
     def _start(self, sample_rate: int, frames_per_chunk: int, pieces: Iterator[tuple[int, np.ndarray]]) -> None:

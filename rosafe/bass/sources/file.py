@@ -18,7 +18,7 @@ from rosafe.bass.sources.base import (
 )
 from rosafe.interface import BASS
 from rosafe.option_types import seconds, whole_number
-from rosafe.sound.audiofile import AudioFile, AudioFileError, channel_pair
+from rosafe.sound.audiofile import NOT_FINITE, AudioFile, AudioFileError, channel_pair
 
 _MAX_RATE = BASS.service("Acquire").parameter("sampleRate").maximum or 0
 _OPTIONS: dict[str, Callable[[str], Any]] = {
@@ -59,6 +59,7 @@ class FileSource(PacedSource):
             if "channels" in options:
                 self._pick(options["channels"])
             self._check(sample_rate, begin)
+            self.remarks += filter(None, [self._file.remark])
             pieces = self._play(begin, frames_per_chunk, options.get("loop", 0))
             self._start(self._file.sample_rate, frames_per_chunk, pieces)
         except BaseException:
@@ -85,7 +86,7 @@ class FileSource(PacedSource):
 
     def _play(self, begin: int, frames_per_chunk: int, loop: int) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the samples from frame `begin`, repeatedly if looped."""
-        repeated = True
+        repeated, replaced, clipped = True, False, False
         while repeated:
             try:
                 self._file.seek(begin)
@@ -96,6 +97,12 @@ class FileSource(PacedSource):
                     position += samples.shape[1]
                     if samples.shape[1] < expected:
                         raise AudioFileError(f"{self._file.path}: expected {self._file.frames} frames, got {position}")
+                    if self._file.not_finite and not replaced:
+                        replaced = True
+                        self.remarks.append(f"{self._file.path}: {NOT_FINITE}")
+                    if self._file.clipped and not clipped:
+                        clipped = True
+                        self.remarks.append(f"{self._file.path}: samples beyond full scale are clipped")
                     yield 0, samples
             except AudioFileError as problem:
                 raise device_error(str(problem)) from None
