@@ -17,10 +17,12 @@ from rosafe.localization.head import checked_rate
 from rosafe.localization.results import read_recordings
 from rosafe.localization.sofa import MAX_GAP
 from rosafe.localization.training import Progress
+from rosafe.offline.memory import refuse_over_available
 from rosafe.offline.sounds import open_sound
 from rosafe.terminal import printable
 
 MAX_SECONDS = 60.0  # of sound that is used for a direction
+MAX_FRAMES = 2**22  # of a direction
 MIN_SECONDS = 1.0
 _MIXED = 24  # pieces of recordings from other directions that make a diffuse noise
 
@@ -53,6 +55,7 @@ def learn_recordings(
         The list or a recording cannot be used: one line.
     """
     sounds: dict[float, list[FloatArray]] = {}
+    size = 0
     for file, azimuth in read_recordings(path):
         with contextlib.closing(open_sound(file)) as reader:
             sample_rate = checked_rate(sample_rate or reader.sample_rate)
@@ -60,8 +63,12 @@ def learn_recordings(
                 raise ValueError(
                     f"{printable(file)}: expected a sample rate of {sample_rate:g} Hz, got {reader.sample_rate}"
                 )
-            frames = min(reader.frames, round(MAX_SECONDS * sample_rate))
-            sounds.setdefault(round(float(angles.wrap(azimuth)), 3), []).append(reader.read(frames) / 2.0**31)
+            parts = sounds.setdefault(round(float(angles.wrap(azimuth)), 3), [])
+            left = min(round(MAX_SECONDS * sample_rate), MAX_FRAMES) - sum(part.shape[1] for part in parts)
+            frames = max(0, min(reader.frames, left))
+            size += 2 * 16 * frames  # of two arrays of floats
+            refuse_over_available(size, printable(os.fspath(path)), "list shorter recordings")
+            parts.append(reader.read(frames) / 2.0**31)
             if reader.not_finite:
                 raise ValueError(f"{printable(file)}: expected finite samples, got {reader.not_finite} others")
             if reader.remark:

@@ -22,7 +22,10 @@ MAX_RATE = 1_000_000  # Hz
 _FORMATS = ("WAV", "WAVEX", "RF64", "W64", "AIFF", "AU", "CAF", "NIST", "FLAC", "OGG", "MP3")  # `Header` checks these
 _UNCODED = {  # bytes of a sample
     **dict.fromkeys(("PCM_S8", "PCM_U8", "ULAW", "ALAW"), 1),
-    **{"PCM_16": 2, "PCM_24": 3, "PCM_32": 4, "FLOAT": 4, "DOUBLE": 8},
+    **dict.fromkeys(("PCM_32", "FLOAT"), 4),
+    "PCM_16": 2,
+    "PCM_24": 3,
+    "DOUBLE": 8,
 }
 _BLOCK = 2**18  # samples that are read at once
 _UNLIMITED = 2**62  # frames; libsndfile states more if it does not know the length

@@ -17,6 +17,7 @@ _NEAR = 2**14  # a program that writes to a pipe states a size that differs from
 _SOX_AIFF = 0x7F000008  # the size that SoX states for a pipe
 _LONG = "expected a header that counts at most 4 GiB, got {} bytes; convert it: `ffmpeg -ignore_length 1 -i IN OUT.w64`"
 TAGS = (b"TAG", b"APETAGEX", b"LYRICSBEGIN")  # that can follow the sound
+_MAX_CHUNKS = 10_000
 _CHECKED_TAIL = 2**16  # bytes
 _W64_GUID = bytes.fromhex("f3acd3118cd100c04f8edb8a")
 _OGG_SOUND = (b"\x01vorbis", b"OpusHead", b"\x7fFLAC", b"Speex   ")
@@ -91,7 +92,7 @@ def read_header(file: BufferedReader, size: int) -> Header:
         return _nist(file, size)
     if begin.startswith(b"OggS"):
         return _ogg(file, size)
-    at = _after_id3(begin)
+    at = _after_id3(file)
     if (info := _bytes(file, at, 26)).startswith(b"fLaC"):
         known = bytes([info[21] & 0x0F]) + info[22:26]
         return Header(offset=at + 21, patch=bytes([info[21] & 0xF0, 0, 0, 0, 0]), frames=int.from_bytes(known, "big"))
@@ -103,14 +104,15 @@ def _bytes(file: BufferedReader, at: int, count: int) -> bytes:
     return file.read(count) or b""
 
 
-def _after_id3(begin: bytes) -> int:
-    """Return the offset of the first byte after a tag of ID3v2."""
-    if not begin.startswith(b"ID3") or len(begin) < 10:
-        return 0
-    length = 0
-    for byte in begin[6:10]:
-        length = length << 7 | byte & 0x7F
-    return 10 + length + (10 if begin[5] & 0x10 else 0)
+def _after_id3(file: BufferedReader) -> int:
+    """Return the offset of the first byte after the tags of ID3v2."""
+    at = 0
+    while (head := _bytes(file, at, 10)).startswith(b"ID3") and len(head) == 10:
+        length = 0
+        for byte in head[6:]:
+            length = length << 7 | byte & 0x7F
+        at += 10 + length + (10 if head[5] & 0x10 else 0)
+    return at
 
 
 def _check_size(stated: int, available: int) -> None:
@@ -184,8 +186,12 @@ class _Chunks:
     def header(self) -> Header:
         layout, at, pad = self._layout, self._layout.start, 0
         data: tuple[int, int] | None = None  # offset and size of the content
+        count = 0
         while chunk := self._at(at):
             name, length = chunk
+            count += 1
+            if count > _MAX_CHUNKS:
+                raise ValueError(f"expected at most {_MAX_CHUNKS} chunks, got more; the file is damaged")
             at += layout.head
             if name == b"ds64":
                 self._long = struct.unpack("<Q", _bytes(self._file, at + 8, 8).ljust(8, b"\0"))[0], at + 8

@@ -156,7 +156,7 @@ def test_mp3_with_length(tmp_path: Path) -> None:
     assert abs(whole(tmp_path / "a.mp3").shape[1] - FRAMES) <= 1152
     (tmp_path / "tag.mp3").write_bytes(data + b"TAG".ljust(128, b"\0"))
     assert whole(tmp_path / "tag.mp3").shape == whole(tmp_path / "a.mp3").shape
-    (tmp_path / "cut.mp3").write_bytes(data[: len(data) // 2])
+    (tmp_path / "cut.mp3").write_bytes(2 * (b"ID3\4\0\0\0\0\x40\0" + bytes(8192)) + data[: len(data) // 2])
     assert "truncated" in refusal(tmp_path / "cut.mp3")
     (tmp_path / "two.mp3").write_bytes(data + data)
     assert f"two.mp3: {len(data)} bytes behind the end of the sound" in AudioFile(tmp_path / "two.mp3").remark
@@ -237,6 +237,15 @@ def test_chunks(tmp_path: Path) -> None:
     for name, content in (("pad", data + b"\0" + chunk), ("none", data + chunk), ("tag", data + b"\0" + b"TAG" * 40)):
         (tmp_path / f"{name}.wav").write_bytes(content)
         assert whole(tmp_path / f"{name}.wav").shape == (1, 999), name
+    odd = b"LIST" + struct.pack("<I", 5) + b"INFOx"
+    for name, before in (("pad", odd + b"\0"), ("none", odd)):
+        (tmp_path / f"{name}.wav").write_bytes(data[:36] + before + data[36:])
+        if name != "none":  # libsndfile does not read it
+            assert whole(tmp_path / f"{name}.wav").shape == (1, 999), name
+        (tmp_path / f"{name}.wav").write_bytes(data[:36] + before + data[36:-100])
+        assert "truncated" in refusal(tmp_path / f"{name}.wav"), name
+    (tmp_path / "many.wav").write_bytes(data[:36] + b"LIST\0\0\0\0" * 10_000 + data[36:])
+    assert "at most 10000 chunks" in refusal(tmp_path / "many.wav")
     (tmp_path / "two.wav").write_bytes(data + b"\0" + data[36:])
     assert "expected one chunk of sound, got several" in refusal(tmp_path / "two.wav")
 
@@ -269,7 +278,9 @@ def test_sound_beyond_4_gib_is_not_lost(tmp_path: Path) -> None:
 def test_other_formats_are_named(tmp_path: Path, begin: bytes, kind: str) -> None:
     path = tmp_path / "a.wav"
     path.write_bytes(begin.ljust(1000, b"\0"))
+    descriptors = len(os.listdir("/proc/self/fd"))
     text = refusal(path)
+    assert len(os.listdir("/proc/self/fd")) == descriptors
     assert f"got {kind}" in text and "`ffmpeg -i IN OUT.wav`" in text
 
 
