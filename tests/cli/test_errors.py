@@ -31,7 +31,7 @@ def assert_untouched(folder: Path, *others: str) -> None:
     [
         (b"", ["bad.wav: expected a sound file, got an empty file"]),
         (b"no sound at all " * 50, ["bad.wav: expected a sound file, got another file: "]),
-        (b"RIFF\xff\xff\xff\xffWAVE", ["bad.wav: expected a sound file, got another file"]),
+        (b"RIFF\xff\xff\xff\xffWAVE", ["bad.wav: expected a chunk of sound, got none"]),
     ],
 )
 def test_other_files_than_sounds(folder: Path, content: bytes, words: list[str]) -> None:
