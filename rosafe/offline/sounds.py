@@ -111,9 +111,9 @@ def read_whole(file: SoundReader) -> np.ndarray:
     try:
         if isinstance(file, BagSound):  # its sound can be compressed to almost nothing
             check_arrays(0, os.path.getsize(file.path), size)
-        check_memory(str(file.path), MAX_BYTES, size, "choose a part, as by `ffmpeg -ss 0 -t 600 -i IN OUT.wav`")
+        check_memory("its sound", MAX_BYTES, size, "choose a part, as by `ffmpeg -ss 0 -t 600 -i IN OUT.wav`")
     except (OSError, ValueError) as problem:
-        raise AudioFileError(f"{file.path}: {problem}" if isinstance(file, BagSound) else str(problem)) from None
+        raise AudioFileError(f"{file.path}: {problem}") from None
     sound = file.read(file.frames)
     if sound.shape[1] != file.frames:
         raise AudioFileError(f"{file.path}: expected {file.frames} frames, got {sound.shape[1]}; the file is truncated")
