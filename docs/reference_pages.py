@@ -298,9 +298,8 @@ $K = 2$ is the ordinary autocorrelation; $K < 2$ compresses the spectrum. Silenc
     ),
     "pitch": Page(
         "Pitch",
-        r"""The mean of the autocorrelations $A_c$ of all $C$ channels has its highest peak at the lag $l$, within
-the range
-`pi_rangeHz`:
+        r"""The lag $l$ is the first peak of the mean of the autocorrelations $A_c$ of all $C$ channels, within the
+range `pi_rangeHz`, that is at least `pi_peakRatio` times as high as the highest one:
 
 $$s[l] = \frac{1}{C} \sum_c A_c[l], \qquad f_0 = \frac{f_s}{l}, \qquad \text{confidence} = s[l]$$
 

@@ -10,7 +10,14 @@ from rosafe.interface.arguments import is_parameter
 
 # Parameters for a purpose, by name. docs/parameters.md describes how they were measured.
 PRESETS: dict[str, dict[str, Any]] = {
-    "speech": {"ac_wSizeSec": 0.06, "pi_rangeHz": [60.0, 400.0], "pi_confThres": 0.2, "pi_medianOrder": 7},
+    "speech": {
+        "ac_wSizeSec": 0.07,
+        "ac_K": 0.8,
+        "pi_rangeHz": [60.0, 400.0],
+        "pi_confThres": 0.2,
+        "pi_medianOrder": 7,
+        "pi_peakRatio": 0.9,
+    },
 }
 MIN_PLAUSIBLE_RATE = 400.0  # Hz; below it, errors suggest that the sample rate is given in kHz
 MIN_PERIODS = 3.0  # of the lowest pitch in the window of the autocorrelation

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rosafe.declarations.literature import MEDDIS_1997, SLANEY_1990
+from rosafe.declarations.literature import MCLEOD_2005, MEDDIS_1997, SLANEY_1990
 from rosafe.declarations.parameter import Parameter
 from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
@@ -26,8 +26,8 @@ class Pitch(Stage):
     """Fundamental frequency, (2, C, L, F) to (2, 3, F): rows pitch (Hz or NaN), rawPitch (Hz or 0), confidence.
 
     1. s[l] = mean over channels of the autocorrelation, for 1 / pi_rangeHz[1] <= l / fs <= 1 / pi_rangeHz[0]
-    2. rawPitch = fs / l and confidence = s[l] at the highest peak of s within that range, the first of equals; the peak
-       of a plateau is at its middle; both are 0 if no peak is above 0
+    2. rawPitch = fs / l and confidence = s[l] at the first peak of s within that range that is at least pi_peakRatio
+       times as high as the highest one; the peak of a plateau is at its middle; both are 0 if no peak is above 0
     3. q[k] = rawPitch[k], or 0 if confidence[k] is below pi_confThres times the greatest confidence of the last 5 s
     4. pitch[k] = median of q[k - floor(n/2)] to q[k + ceil(n/2) - 1], n = pi_medianOrder; q is 0 before the first frame
 
@@ -77,11 +77,21 @@ class Pitch(Stage):
                 MAX_ORDER,
                 aliases=("p_orderMedFilt",),
             ),
+            Parameter(
+                "pi_peakRatio",
+                "double",
+                1.0,
+                "Height of the first peak that counts, relative to the highest; below 1: fewer octaves below the pitch",
+                0.0,
+                1.0,
+                open_minimum=True,
+            ),
         ),
         port_doc="pitch (Hz), rawPitch (Hz) and confidence as channels",
         references=(
             Citation(MEDDIS_1997, "sum of the autocorrelations of all channels"),
             Citation(SLANEY_1990, "peak of the sum"),
+            Citation(MCLEOD_2005, "first peak above a part of the highest"),
         ),
     )
     INPUT = ("ear", "channel", "lag", "time")
@@ -112,7 +122,7 @@ class Pitch(Stage):
         summary = correlations[:, :, self._range].sum(axis=1) / channels
         arriving = np.zeros((len(summary), 3, summary.shape[-1]))
         chosen, raw, confidence = arriving[:, 0], arriving[:, 1], arriving[:, 2]
-        lag, confidence[:] = highest_peak(np.ascontiguousarray(summary.swapaxes(1, 2)))
+        lag, confidence[:] = first_high_peak(np.ascontiguousarray(summary.swapaxes(1, 2)), self.values["pi_peakRatio"])
         np.divide(self.sample_rate, lag + self._range.start, out=raw, where=confidence > 0)
         self._confidences, greatest = running_maximum(self._confidences, confidence, self._reach)
         np.copyto(chosen, raw, where=confidence >= self.values["pi_confThres"] * greatest)
@@ -168,25 +178,28 @@ class Pitch(Stage):
         self._reach = max(1, round_half_away(CONFIDENCE_SECONDS * self.input_format.rate))  # frames
 
 
-def highest_peak(curves: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-    """Return index and height of the highest peak of each of curves (..., n), n >= 3; the height is 0 without a peak.
+def first_high_peak(curves: FloatArray, ratio: float) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return index and height of a peak of each of curves (..., n), n >= 3; the height is 0 without a peak.
 
-    Of equally high peaks, it is the first. A plateau is one peak at its middle, rounded down. The ends and values below
-    0 do not count as peaks.
+    It is the first one that is at least `ratio` times as high as the highest. A plateau is one peak at its middle,
+    rounded down. The ends and values below 0 do not count as peaks.
     """
-    inner = curves[..., 1:-1]
-    tops = (inner > curves[..., :-2]) & (inner >= curves[..., 2:])
-    heights = np.where(tops, inner, -np.inf)
-    peak = heights.argmax(axis=-1) + 1
-    height = heights.max(axis=-1)
-    after = peak + 1 + curves.shape[-1] * np.arange(peak.size).reshape(peak.shape)
-    if (height > curves.take(after)).all():  # no plateaus: the usual case
-        return peak, np.maximum(height, 0.0)
-    return _highest_of_plateaus(curves)
+    inner, after = curves[..., 1:-1], curves[..., 2:]
+    tops = (inner > curves[..., :-2]) & (inner >= after)
+    if not (tops & (inner == after)).any():  # no plateaus: the usual case
+        first, height = _first_of(np.where(tops, inner, -np.inf), ratio)
+        return first + 1, np.maximum(height, 0.0)
+    return _first_of_plateaus(curves, ratio)
 
 
-def _highest_of_plateaus(curves: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-    """Compute `highest_peak` of curves that may have plateaus or no peak."""
+def _first_of(heights: FloatArray, ratio: float) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return index and value of the first of heights (..., n) that is at least `ratio` times the highest."""
+    first = (heights >= ratio * heights.max(axis=-1, keepdims=True)).argmax(axis=-1)
+    return first, np.take_along_axis(heights, first[..., np.newaxis], axis=-1)[..., 0]
+
+
+def _first_of_plateaus(curves: FloatArray, ratio: float) -> tuple[NDArray[np.int64], FloatArray]:
+    """Compute `first_high_peak` of curves that may have plateaus or no peak."""
     here, following = curves[..., :-1], curves[..., 1:]
     rises = following > here
     number = 2 * np.arange(curves.shape[-1])
@@ -195,9 +208,9 @@ def _highest_of_plateaus(curves: FloatArray) -> tuple[NDArray[np.int64], FloatAr
     steps = np.minimum.accumulate(steps[..., ::-1], axis=-1)[..., ::-1][..., 1:]
     peaks = rises[..., :-1] & (steps & 1 == 1)
     heights = np.where(peaks, following[..., :-1], -np.inf)
-    begin = heights.argmax(axis=-1)[..., np.newaxis]
-    end = np.take_along_axis(steps, begin, axis=-1) // 2
-    return ((begin + 1 + end) // 2)[..., 0], np.maximum(heights.max(axis=-1), 0.0)
+    begin, height = _first_of(heights, ratio)
+    end = np.take_along_axis(steps, begin[..., np.newaxis], axis=-1)[..., 0] // 2
+    return (begin + 1 + end) // 2, np.maximum(height, 0.0)
 
 
 def running_maximum(before: FloatArray, values: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:

@@ -321,6 +321,16 @@ def test_the_preset_for_speech_on_vowels(rate: int) -> None:
     assert np.concatenate(errors).mean() <= 0.01
 
 
+@pytest.mark.parametrize("formants", [(700, 1220, 2600), *FORMANTS.values()])
+@pytest.mark.parametrize("frequency", [260, 310, 345, 380, 392])
+def test_the_preset_for_speech_on_high_voices(frequency: int, formants: tuple[int, ...]) -> None:
+    """The octave below is not reported."""
+    sound = vowel(frequency, formants, RATE)
+    result = rosafe.process(sound, RATE, parameters=rosafe.PRESETS["speech"], outputs="pitch")
+    cents = 1200 * np.log2(result["pitch"][0, 0, 8:-8] / frequency)
+    assert np.mean(np.abs(cents) <= 50) >= 0.95
+
+
 def test_outputs_without_frames() -> None:
     with pytest.warns(UserWarning, match="ild, ratemap: no frames: the sound is shorter than the windows"):
         rosafe.process(SOUND[:, :300], RATE, parameters=FEW, outputs=["ild", "ratemap", "input"])

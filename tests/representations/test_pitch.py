@@ -44,7 +44,7 @@ def peaks_at(lags: list[int], heights: list[float]) -> FloatArray:
 
 
 def by_the_book(
-    frames: FloatArray, limits: list[float], threshold: float, order: int, rate: float = 10.0
+    frames: FloatArray, limits: list[float], threshold: float, order: int, rate: float = 10.0, ratio: float = 1.0
 ) -> tuple[list[float], list[float], list[float]]:
     """Compute pitch, rawPitch and confidence of one ear (C, L, F), without pending frames."""
     raw: list[float] = []
@@ -56,7 +56,10 @@ def by_the_book(
         lags = [lag for lag in range(len(summary)) if 1 / max(limits) <= lag / FS <= 1 / min(limits)]
         curve = np.array([summary[lag] for lag in lags])
         peaks = [(float(curve[at]), -int(at)) for at in scipy.signal.find_peaks(curve)[0] if curve[at] > 0]
-        height, place = max(peaks, default=(0.0, 0))
+        highest = max(peaks, default=(0.0, 0))[0]
+        height, place = max(
+            (peak for peak in peaks if peak[0] >= ratio * highest), key=lambda p: p[1], default=(0.0, 0)
+        )
         raw.append(FS / lags[-place] if peaks else 0.0)
         confidence.append(height)
         chosen.append(raw[-1] if height >= threshold * max(confidence[-reach:]) else 0.0)
@@ -88,6 +91,17 @@ def test_the_result_follows_the_formula(threshold: float, order: int, channels: 
         np.testing.assert_allclose(got[ear], expected, rtol=1e-14, atol=1e-15)
     if channels == 1:
         assert (got[:, 1] == 0).any() and (got[:, 1] > 0).any()
+
+
+@pytest.mark.parametrize("ratio", [0.2, 0.6, 0.9, 1.0])
+def test_the_first_high_peak(ratio: float) -> None:
+    """Of peaks that are high enough, the one at the shortest lag; with blocks of any length."""
+    x = correlations(170, 5)
+    stage = Pitch(GIVEN, **WIDE, pi_peakRatio=ratio)
+    got = np.concatenate([stage.process(block) for block in cut(x, [1, 3, 0, 40])], axis=-1)
+    for ear in range(2):
+        expected = by_the_book(x[ear], [40.0, 400.0], 0.7, 3, ratio=ratio)
+        np.testing.assert_allclose(got[ear], expected, rtol=1e-14, atol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -230,9 +244,19 @@ def test_the_output() -> None:
 
 def test_the_defaults_and_the_documentations_names() -> None:
     stage = Pitch(SignalFormat(16000.0, 100.0, True, 160, 320, (), "", lags=318))
-    assert stage.parameters == {"pi_rangeHz": [80.0, 400.0], "pi_confThres": 0.7, "pi_medianOrder": 3}
+    assert stage.parameters == {
+        "pi_rangeHz": [80.0, 400.0],
+        "pi_confThres": 0.7,
+        "pi_medianOrder": 3,
+        "pi_peakRatio": 1.0,
+    }
     stage.configure(p_pitchRangeHz=[100, 300], p_confThresPerc=0, p_orderMedFilt=5)
-    assert stage.parameters == {"pi_rangeHz": [100.0, 300.0], "pi_confThres": 0.0, "pi_medianOrder": 5}
+    assert stage.parameters == {
+        "pi_rangeHz": [100.0, 300.0],
+        "pi_confThres": 0.0,
+        "pi_medianOrder": 5,
+        "pi_peakRatio": 1.0,
+    }
 
 
 @pytest.mark.parametrize("orders", [(3, 9), (9, 3), (1, 99), (99, 1), (4, 5), (5, 4), (2, 1)])
@@ -388,15 +412,16 @@ def test_a_glide() -> None:
         np.testing.assert_array_less(np.abs(found / expected - 1)[voiced], 0.02)
 
 
+@pytest.mark.parametrize("ratio", [0.4, 1.0])
 @pytest.mark.parametrize("steps", [2, 3, 5, 1000])
-def test_the_fast_path_finds_the_same_peaks(steps: int) -> None:
+def test_the_fast_path_finds_the_same_peaks(steps: int, ratio: float) -> None:
     """Values with few levels have plateaus, those with many have none."""
     rng = np.random.default_rng(steps)
     for size in (3, 4, 17, 100):
         curves = rng.integers(-1, steps, (2, 5, size)) / 10
         curves[:, 0] = 0.0
         for some in (curves, curves[:, 1:], curves[:1, 1:2]):
-            got, simple = pitch.highest_peak(some), pitch._highest_of_plateaus(some)
+            got, simple = pitch.first_high_peak(some, ratio), pitch._first_of_plateaus(some, ratio)
             np.testing.assert_array_equal(got[1], simple[1])
             found = simple[1] > 0
             np.testing.assert_array_equal(got[0][found], simple[0][found])

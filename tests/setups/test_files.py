@@ -69,7 +69,9 @@ def test_a_preset_applies_to_all_processors() -> None:
     text += "  bank: {kind: filterbank, parent: time}\n  ihc: {kind: ihc, parent: bank}\n"
     text += "  ac: {kind: autocorrelation, parent: ihc}\n  pitch: {kind: pitch, parent: ac, pi_confThres: 0.5}\n"
     explicit = {processor.name: processor.explicit for processor in read(text).processors}
-    assert explicit["ac"] == {"ac_wSizeSec": PRESETS["speech"]["ac_wSizeSec"]} and not explicit["bank"]
+    assert (
+        explicit["ac"] == {name: PRESETS["speech"][name] for name in ("ac_wSizeSec", "ac_K")} and not explicit["bank"]
+    )
     assert explicit["pitch"]["pi_confThres"] == 0.5
     assert explicit["pitch"]["pi_medianOrder"] == PRESETS["speech"]["pi_medianOrder"]
 
