@@ -14,7 +14,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "ac_wSizeSec": 0.07,
         "ac_K": 0.8,
         "pi_rangeHz": [60.0, 400.0],
-        "pi_confThres": 0.2,
+        "pi_confThres": 0.15,
         "pi_medianOrder": 7,
         "pi_peakRatio": 0.9,
     },
