@@ -44,7 +44,7 @@ synthetic vowels (random formants, four glottal pulses, fixed and gliding pitch,
 | preset | 0.93 | 1.00 | 0.97 | 1.00 | 1.00 | 0.98 | 0.98 |
 | `pyin` | 1.00 | 1.00 | 1.00 | 1.00 | 1.00 | 1.00 | 0.99 |
 
-Most errors are at 5 dB; `pyin` also uses the continuity of the pitch. In two synthetic sentences and two recordings of
+`pyin` also uses the continuity of the pitch. In two synthetic sentences and two recordings of
 speech, 82 to 94 % of the frames that `pyin` takes as voiced are within 50 cents of it. In a synthetic voice of 280 Hz
 (espeak-ng es+f1), 45 % of these frames are an octave below `pyin`. The defaults, which are those of the original, suit
 pitches above 150 Hz.
