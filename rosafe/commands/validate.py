@@ -1,8 +1,8 @@
 """Compare each representation with publications, closed forms, a measured head and other toolboxes.
 
-One line is printed for each comparison: the deviation, its tolerance and the source of the reference values. Toolboxes
-that are not installed are skipped. Nothing is installed, and no network is needed. docs/validation.md is the page that
--o writes."""
+One line is printed for each comparison: the deviation, its tolerance and the source of the reference values; known
+limitations are reported without a tolerance. Toolboxes that are not installed are skipped. Nothing is installed, and no
+network is needed. docs/validation.md is the page that -o writes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.usage = "rosafe validate [--short] [--self-test] [-o FILE.md]"
+    parser.usage = "rosafe validate [--short] [--self-test] [-o FILE.md]\n       rosafe validate --figures FOLDER"
     parser.add_argument("--short", action="store_true", help="without other toolboxes")
     parser.add_argument(
         "--self-test",
@@ -35,17 +35,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.md",
         help="write a page with a table, and pictures beside it; they are replaced if they exist",
     )
+    parser.add_argument(
+        "--figures",
+        metavar="FOLDER",
+        help="only write published curves with those of rosAFE: figures.md and pictures; existing files are replaced",
+    )
     parser.epilog = (
         "exit status: 0 if all comparisons passed (with --self-test: if all disturbances were detected), 1 if not\n\n"
         "examples:\n"
         "  rosafe validate\n"
         "  rosafe validate --self-test\n"
-        "  rosafe validate -o validation.md"
+        "  rosafe validate -o validation.md\n"
+        "  rosafe validate --figures ."
     )
 
 
 def run(options: argparse.Namespace) -> int:
     """Run the comparisons and print or write their results."""
+    if options.figures:
+        return _write_figures(options)
     target = Path(options.to) if options.to else None
     if target and options.self_test:
         options.usage_error("-o: expected without --self-test, whose results the page contains as well, got both")
@@ -59,15 +67,31 @@ def run(options: argparse.Namespace) -> int:
     from rosafe.validation import report
 
     begin, disturbed = time.monotonic(), options.self_test
-    comparisons = report.comparisons(options.short)
+    comparisons = [row for row in report.comparisons(options.short) if row.disturbance or not disturbed]
     rows = report.run(comparisons, disturbed, lambda row: print(report.line(row, disturbed), flush=True))
-    computed = [row for row in rows if not row.skipped]
+    computed = [row for row in rows if not row.skipped and row.comparison.disturbance]
     good = sum(row.passed is not disturbed for row in computed)
     word = "disturbances detected" if disturbed else "comparisons passed"
-    print(f"{good} of {len(computed)} {word}, {len(rows) - len(computed)} skipped, in {time.monotonic() - begin:.0f} s")
+    skipped, seconds = sum(row.skipped for row in rows), time.monotonic() - begin
+    print(f"{good} of {len(computed)} {word}, {skipped} skipped, in {seconds:.0f} s")
     if target:
-        _write(target, rows, report.run(comparisons, disturbed=True))
+        _write(target, rows, report.run((row for row in comparisons if row.disturbance), disturbed=True))
     return 0 if good == len(computed) else 1
+
+
+def _write_figures(options: argparse.Namespace) -> int:
+    """Write the published figures."""
+    if options.to or options.self_test or options.short:
+        options.usage_error("--figures: expected without other options")
+    folder = Path(options.figures)
+    if not folder.is_dir():
+        raise CommandError(f"--figures: expected an existing folder, got {folder}")
+    require("matplotlib", "pictures")
+    from rosafe.validation import figures, report
+
+    for path in figures.write_published(folder, report.compute):
+        print(path)
+    return 0
 
 
 def _write(target: Path, rows: list[Row], disturbed: list[Row]) -> None:

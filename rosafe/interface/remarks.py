@@ -18,6 +18,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "pi_medianOrder": 7,
         "pi_peakRatio": 0.9,
     },
+    "onsets": {"trm_minStrengthdB": 8.0, "trm_minSpread": 6, "trm_minValuedB": -80.0},
 }
 MIN_PLAUSIBLE_RATE = 400.0  # Hz; below it, errors suggest that the sample rate is given in kHz
 MIN_PERIODS = 3.0  # of the lowest pitch in the window of the autocorrelation

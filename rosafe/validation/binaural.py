@@ -8,15 +8,19 @@ import scipy.signal
 from rosafe.declarations.literature import BRAASCH_2013, FALLER_2004, MAY_2011, WALLACH_1949
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.validation.comparison import (
+    INDEPENDENT,
+    STAGE,
     Collection,
     Curve,
     Measured,
     Origin,
     Process,
+    altered,
     parameter,
     scaled,
     shifted,
 )
+from rosafe.validation.published import BRAASCH_DELAYS, BRAASCH_ITD
 from rosafe.validation.stimuli import delayed, largest, noise
 
 ROWS = Collection()
@@ -30,6 +34,8 @@ RATE = 16000
     "dB",
     1e-4,  # the front-end adds 2.2e-16 to the energies
     scaled("ild", 1 + 1e-5),
+    evidence=INDEPENDENT,
+    criterion="largest difference over all channels and frames",
 )
 def level_differences(process: Process) -> Measured:
     expected = np.arange(-30.0, 31, 10)
@@ -48,6 +54,8 @@ def level_differences(process: Process) -> Measured:
     "",
     1e-9,  # the front-end adds 2.2e-16 to the product of the energies
     parameter("cc_wname", "hamming"),
+    evidence=STAGE,
+    criterion="largest difference, 8 channels of one frame",
 )
 def cross_correlation(process: Process) -> Measured:
     signal = np.stack((noise(3200, 1) + noise(3200, 2), np.roll(noise(3200, 1), 5) + noise(3200, 3)))
@@ -72,6 +80,8 @@ def cross_correlation(process: Process) -> Measured:
     "µs",
     2.0,  # parabola through three lags of 62.5 µs
     shifted("itd", 3e-6, "s"),
+    evidence=INDEPENDENT,
+    criterion="largest difference of the median of each channel",
 )
 def time_differences(process: Process) -> Measured:
     expected = np.linspace(-600, 600, 9)
@@ -92,6 +102,8 @@ def time_differences(process: Process) -> Measured:
     "",
     0.02,  # 4 s of noise
     shifted("ic", -0.04),
+    evidence=INDEPENDENT,
+    criterion="largest difference of the mean over channels and frames",
 )
 def coherence(process: Process) -> Measured:
     expected = np.array([0.5, 0.7, 0.9, 1.0])
@@ -103,6 +115,9 @@ def coherence(process: Process) -> Measured:
         signal = np.stack((common, correlation * common + np.sqrt(1 - correlation**2) * other))
         measured.append(process(signal, RATE, parameters, ["ic"])["ic"].mean())
     return Measured.of(expected, expected, measured, "correlation", "IC")
+
+
+LEAD = "largest difference of the median over channels from 300 to 1300 Hz and all frames but the first ten"
 
 
 def lead_and_lag(itd: float, level_db: float) -> FloatArray:
@@ -118,6 +133,8 @@ def lead_and_lag(itd: float, level_db: float) -> FloatArray:
     "µs",
     63.0,  # one lag
     shifted("precedence_itd", 62.5e-6, "s"),
+    evidence=INDEPENDENT,
+    criterion=LEAD,
 )
 def first_wave_front(process: Process) -> float:
     return _lead_error(process, -3.0)
@@ -130,6 +147,8 @@ def first_wave_front(process: Process) -> float:
     "µs",
     1.0,
     shifted("precedence_itd", 62.5e-6, "s"),
+    evidence=INDEPENDENT,
+    criterion=LEAD,
 )
 def localization_dominance(process: Process) -> float:
     return max(_lead_error(process, level) for level in (-20.0, -10.0, -6.0))
@@ -152,6 +171,9 @@ def _lead_error(process: Process, level_db: float) -> float:
     "µs",
     1.0,
     shifted("precedence_itd", 62.5e-6, "s"),
+    evidence=INDEPENDENT,
+    criterion="largest difference of the median over channels from 300 to 1300 Hz and the frames with clicks, which "
+    "have more than 30 % of the highest level",
 )
 def click_pairs(process: Process) -> Measured:
     delays, itd, found = np.array([2.0, 3, 4, 5, 7]), 0.000375, []
@@ -172,3 +194,90 @@ def _clicks(itd: float, delay: float) -> FloatArray:
         first, second = round(begin * RATE), round(begin * RATE) + round(delay * RATE)
         signal[[0, 1, 1, 0], [first + shift, first, second + shift, second]] += 1.0
     return signal
+
+
+# --- the published precedence model --------------------------------------------------------------------------------
+
+
+BURST_RATE = 48000
+SEEDS = (1, 2, 3)
+LEAD_ITD = 0.3  # ms; the lag has the opposite one
+
+
+def lead_lag(delay: float, level: float, seed: int) -> FloatArray:
+    """Return noise from 100 to 900 Hz of 200 ms with ramps of 20 ms, and its lag, (2, N).
+
+    Parameters
+    ----------
+    delay : float
+        Of the lag in ms.
+    level : float
+        Of the lag relative to the lead in dB.
+    seed : int
+        Of the noise.
+    """
+    count, ramp = 9600, np.sin(np.pi / 2 * np.arange(960) / 959) ** 2
+    bins, random = np.fft.rfftfreq(count, 1 / BURST_RATE), np.random.default_rng(seed)
+    spectrum = random.standard_normal(len(bins)) + 1j * random.standard_normal(len(bins))
+    burst = np.fft.irfft(np.where((bins >= 100) & (bins <= 900), spectrum, 0), count)
+    burst /= np.abs(burst).max()
+    burst[:960] *= ramp
+    burst[-960:] *= ramp[::-1]
+    itd, late = round(LEAD_ITD * BURST_RATE / 1000), round(delay * BURST_RATE / 1000)
+    sound = np.zeros((2, count + late + itd))
+    for ear, begin, gain in (
+        (0, itd, 1.0),
+        (1, 0, 1.0),
+        (0, late, 10 ** (level / 20)),
+        (1, late + itd, 10 ** (level / 20)),
+    ):
+        sound[ear, begin : begin + count] += gain * burst
+    return sound
+
+
+def lateral_itd(process: Process, delay: float, level: float, window: float) -> float:
+    """Return the ITD of the published decision device in ms, mean of three noises.
+
+    It is the centroid of the correlation, summed over channels and frames, where this exceeds half of its maximum.
+    """
+    found = []
+    parameters = {"fb_lowFreqHz": 100.0, "fb_highFreqHz": 1400.0, "prec_wSizeSec": window, "prec_hSizeSec": window / 2}
+    for seed in SEEDS:
+        padding = round((window + 0.01) * BURST_RATE)
+        sound = np.pad(lead_lag(delay, level, seed), ((0, 0), (0, padding)))
+        result = process(sound, BURST_RATE, parameters, ["precedence"])
+        total = result["precedence_cc"].sum((0, 2))
+        total -= total.min()
+        total[total < total.max() / 2] = 0
+        found.append(1e3 * float(np.sum(result["prec_lags"] * total) / total.sum()))
+    return float(np.mean(found))
+
+
+def _against_model(process: Process, level: float, window: float) -> Measured:
+    expected = 1e3 * np.array(BRAASCH_ITD[level])
+    measured = [1e3 * lateral_itd(process, float(delay), level, window) for delay in BRAASCH_DELAYS]
+    return Measured.of(BRAASCH_DELAYS, expected, measured, "delay of the lag (ms)", "ITD (µs)")
+
+
+MODEL = Origin("program of the author, computed with GNU Octave; see figures.md", BRAASCH_2013)
+CENTROID = "largest difference of the centroid of the correlation, over delays of 1 to 8 ms"
+for _level, _window, _tolerance in ((-6, 0.02, 100.0), (-3, 0.05, 100.0)):
+    ROWS.add(
+        "precedence",
+        f"noise of 200 ms and its lag of {_level} dB from the other side after 1 to 8 ms, ITDs of 0.3 and -0.3 ms",
+        MODEL,
+        "µs",
+        _tolerance,
+        altered("correlation shifted by 10 lags", "precedence_cc", lambda values: np.roll(values, 10, axis=1)),
+        evidence=INDEPENDENT,
+        criterion=CENTROID,
+    )(lambda process, level=_level, window=_window: _against_model(process, level, window))
+for _level, _window in ((-3, 0.02), (0, 0.02), (0, 0.05), (4, 0.05)):
+    _words = "equal level" if not _level else f"{_level:+d} dB"
+    ROWS.limitation(
+        "precedence",
+        f"noise of 200 ms and its lag of {_words} from the other side after 1 to 8 ms, windows of {1e3 * _window:g} ms",
+        MODEL,
+        "µs",
+        criterion=CENTROID,
+    )(lambda process, level=_level, window=_window: _against_model(process, level, window))

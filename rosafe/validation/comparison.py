@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -15,12 +16,19 @@ import numpy as np
 from rosafe.declarations.reference import Reference
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.numeric_limits import FloatArray
-from rosafe.offline.result import Result
 from rosafe.validation.stimuli import largest
 
-KEMAR = Path("/usr/share/libmysofa/default.sofa")  # MIT KEMAR, in Debian's libmysofa1
+KEMAR = "/usr/share/libmysofa/default.sofa"  # measured responses of MIT KEMAR
+TALKERS = ("/usr/share/sounds/alsa/Front_Center.wav", "/usr/share/sounds/alsa/Rear_Right.wav")  # recorded words
+PACKAGES = {KEMAR: "libmysofa1", **dict.fromkeys(TALKERS, "alsa-utils")}  # of Debian
 
-Process = Callable[[Any, float, Mapping[str, Any], Sequence[str]], Result]
+# What a comparison is evidence of. The order is that of the page.
+INDEPENDENT = "independent"  # the expected numbers come from a publication, a closed form, a measurement or a program
+STAGE = "stage"  # another program computes one stage from the project's own input of that stage
+DEFINITION = "definition"  # the expected numbers follow from the definition that the project itself has chosen
+LIMITATION = "limitation"  # a number is reported; there is no tolerance
+
+Process = Callable[[Any, float, Mapping[str, Any], Sequence[str]], Any]
 Change = Callable[[Process], Process]
 
 
@@ -50,6 +58,9 @@ class Measured:
         """Return the largest difference of two curves, with both of them."""
         curve = Curve(x, expected, measured, x_label, y_label, logarithmic)
         return cls(largest(np.subtract(measured, expected)), curve)
+
+
+Measure = Callable[[Process], Measured | float]
 
 
 @dataclass(frozen=True)
@@ -105,14 +116,20 @@ class Comparison:
     unit : str
         Of the deviation.
     tolerance : float
-        The largest deviation of a valid representation.
-    disturbance : Disturbance
-        An error whose deviation exceeds the tolerance.
+        The largest deviation of a valid representation; infinite for a limitation.
+    disturbance : Disturbance or None
+        An error whose deviation exceeds the tolerance; None for a limitation.
     measure : callable
         Computes the deviation with a function like `process`.
-    requires : str
-        A module, or a path, without which the comparison is skipped. A package that imports its parts at their first
+    evidence : str
+        `INDEPENDENT`, `STAGE`, `DEFINITION` or `LIMITATION`.
+    criterion : str
+        How the deviation is computed from the values.
+    requires : tuple of str
+        Modules, and paths, without which the comparison is skipped. A package that imports its parts at their first
         use (librosa) is named with the part.
+    under_test : callable or None
+        The function under test, called like `process`; None for `rosafe.process`.
     """
 
     kind: str
@@ -120,14 +137,17 @@ class Comparison:
     source: Origin
     unit: str
     tolerance: float
-    disturbance: Disturbance
-    measure: Callable[[Process], Measured | float]
-    requires: str = ""
+    disturbance: Disturbance | None
+    measure: Measure
+    evidence: str
+    criterion: str = "largest difference"
+    requires: tuple[str, ...] = ()
+    under_test: Process | None = None
 
     @property
     def short(self) -> bool:
         """Whether it is part of the short form, which needs no other toolbox."""
-        return not self.requires or "/" in self.requires
+        return all("/" in need for need in self.requires)
 
     @property
     def group(self) -> str:
@@ -137,9 +157,16 @@ class Comparison:
     @property
     def missing(self) -> str:
         """The reason for which it cannot be computed here; empty if it can."""
-        if "/" in self.requires and not Path(self.requires).exists():
-            return f"{self.requires} is not installed (Debian's libmysofa1)"
-        return _import_problem("h5py" if "/" in self.requires else self.requires) if self.requires else ""
+        return next(filter(None, map(_problem, self.requires)), "")
+
+
+def _problem(need: str) -> str:
+    """Return the reason for which a module or a path cannot be used; empty if it can."""
+    if "/" not in need:
+        return _import_problem(need)
+    if not Path(need).exists():
+        return f"{need} is not installed" + (f" (Debian's {PACKAGES[need]})" if need in PACKAGES else "")
+    return _import_problem("h5py") if need.endswith(".sofa") else ""
 
 
 @lru_cache
@@ -168,17 +195,22 @@ class Collection:
         source: Origin,
         unit: str,
         tolerance: float,
-        disturbance: Disturbance,
-        requires: str = "",
-    ) -> Callable[[Callable[[Process], Measured | float]], Callable[[Process], Measured | float]]:
-        """Return a decorator that adds a comparison; its arguments are the attributes of `Comparison`."""
+        disturbance: Disturbance | None,
+        **more: Any,
+    ) -> Callable[[Measure], Measure]:
+        """Return a decorator that adds a comparison; the arguments are the attributes of `Comparison`."""
 
-        def register(measure: Callable[[Process], Measured | float]) -> Callable[[Process], Measured | float]:
-            row = Comparison(kind, subject, source, unit, tolerance, disturbance, measure, requires)
-            self.comparisons.append(row)
+        def register(measure: Measure) -> Measure:
+            self.comparisons.append(Comparison(kind, subject, source, unit, tolerance, disturbance, measure, **more))
             return measure
 
         return register
+
+    def limitation(
+        self, kind: str, subject: str, source: Origin, unit: str, **more: Any
+    ) -> Callable[[Measure], Measure]:
+        """Return a decorator that adds a number without a tolerance."""
+        return self.add(kind, subject, source, unit, math.inf, None, evidence=LIMITATION, **more)
 
 
 def parameter(name: str, value: Any) -> Disturbance:
@@ -194,7 +226,7 @@ def altered(text: str, name: str, change_array: Callable[[FloatArray], FloatArra
     """Return a disturbance of one output."""
 
     def change(process: Process) -> Process:
-        def run(signal: FloatArray, rate: float, parameters: Mapping[str, Any], outputs: Sequence[str]) -> Result:
+        def run(signal: FloatArray, rate: float, parameters: Mapping[str, Any], outputs: Sequence[str]) -> Any:
             result = process(signal, rate, parameters, outputs)
             if name in result:
                 result[name] = change_array(result[name])

@@ -1,14 +1,20 @@
-"""Pictures of the comparisons: reference values as lines, measured values as dots."""
+"""Pictures of the comparisons, reference values as lines and measured values as dots; and the published figures."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rosafe.output import write_whole
+from rosafe.validation import published
+from rosafe.validation.binaural import lateral_itd
+from rosafe.validation.comparison import Process
+from rosafe.validation.periphery import Drnl, burst_response, drnl_measured, jepsen_drnl
 from rosafe.validation.report import Row
 from rosafe.view.axes import save, style
 
@@ -28,16 +34,19 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     rosafe.output.OutputError
         The file cannot be written.
     """
+    _draw([row for row in rows if row.curve is not None], _panel, path)
+
+
+def _draw(shown: Sequence[Any], panel: Callable[[Axes, Any], None], path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    shown = [row for row in rows if row.curve is not None]
     with style():
         height = 2.6 * -(-len(shown) // _COLUMNS)
         figure = Figure(figsize=(4.4 * _COLUMNS, height), dpi=_DPI, layout="constrained")
         FigureCanvasAgg(figure)
-        for place, row in enumerate(shown):
-            _panel(figure.add_subplot(-(-len(shown) // _COLUMNS), _COLUMNS, place + 1), row)
+        for place, one in enumerate(shown):
+            panel(figure.add_subplot(-(-len(shown) // _COLUMNS), _COLUMNS, place + 1), one)
     save(figure, path)
 
 
@@ -56,3 +65,180 @@ def _panel(axes: Axes, row: Row) -> None:
     subject = f"{row.comparison.kind}: {row.comparison.subject}"
     axes.set_title(textwrap.shorten(subject, 52, placeholder=" ..."), fontsize=8.5)
     axes.legend(fontsize=7.5, frameon=False)
+
+
+# --- published figures -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Published values (dots) and values of rosAFE (lines) over a common axis.
+
+    `curves` are further values of rosAFE or of a publication, as (name, values).
+    """
+
+    title: str
+    x: Any
+    published: Any
+    curves: tuple[tuple[str, Any], ...]
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True)
+class Published:
+    """A figure: the name of its file, heading, source and short name of the published values, labels, remark, panels."""
+
+    name: str
+    heading: str
+    source: str
+    short: str
+    labels: tuple[str, str]
+    remark: str
+    panels: tuple[Panel, ...]
+
+
+def published_figures(process: Process) -> tuple[Published, ...]:
+    """Compute all figures with a function like `process`."""
+    return (_precedence(process), _drnl(process), _adaptation(process))
+
+
+def _precedence(process: Process) -> Published:
+    panels = []
+    for level, expected in published.BRAASCH_ITD.items():
+        curves = []
+        for window in (0.02, 0.05):
+            found = [lateral_itd(process, float(delay), level, window) for delay in published.BRAASCH_DELAYS]
+            curves.append((f"rosAFE, {1e3 * window:g} ms", np.array(found)))
+        panels.append(
+            Panel(
+                f"lag of {level:+d} dB" if level else "lag of equal level",
+                published.BRAASCH_DELAYS,
+                np.array(expected),
+                tuple(curves),
+            )
+        )
+    return Published(
+        "figures-precedence",
+        "Precedence effect: lead and lag",
+        published.BRAASCH_SOURCE,
+        "program of Braasch (2013)",
+        ("delay of the lag (ms)", "ITD (ms)"),
+        "Noise of 200 ms from 100 to 900 Hz; the lead has an ITD of 0.3 ms, the lag one of -0.3 ms. The ITD is "
+        "the centroid of the correlation, summed over channels and frames, where it exceeds half of its maximum. "
+        "The author's program analyses the whole sound at once, normalises the four correlations between which it "
+        "chooses, and sums correlations weighted by energy. `precedence`, like the Two!Ears front-end, analyses "
+        "frames of `prec_wSizeSec`, compares correlations that are not normalised, and outputs normalised "
+        "correlations. So the lead dominates for a lag of -6 dB, and with windows of 50 ms for a lag of -3 dB. "
+        "With the default windows of 20 ms, it holds at -3 dB up to delays of about 5 ms. At equal level it holds "
+        "in part, best at 3 ms; with the default windows, the ITD is near 0 from 6 ms on. If the lag is louder, "
+        "rosAFE follows the lag and the published model the lead.",
+        tuple(panels),
+    )
+
+
+def _drnl(process: Process) -> Published:
+    rate, velocities = 44100.0, 10 ** np.arange(-10, -4.4, 0.5)
+    panels = []
+    for frequency, (centre, width, gain, best, narrow, slope, scale) in published.LOPEZPOVEDA_TABLE_2.items():
+        sections = ((3, 4), (3, 0), (3, 3))
+        listener = Drnl((centre, width, centre), gain, (best, narrow, best), slope, scale, 0.25, sections)
+        curves = (
+            ("rosAFE", drnl_measured(process, velocities, frequency, rate)),
+            ("Jepsen et al. (2008), closed form", jepsen_drnl(frequency).output(velocities, frequency, rate)),
+        )
+        expected = listener.output(velocities, frequency, rate)
+        panels.append(Panel(f"{frequency} Hz", 20 * np.log10(velocities), expected, curves))
+    return Published(
+        "figures-drnl",
+        "DRNL: input-output functions",
+        published.LOPEZPOVEDA_SOURCE,
+        "parameters of Lopez-Poveda and Meddis (2001)",
+        ("stapes velocity (dB re 1 m/s)", "output (dB)"),
+        "Tones at the frequency of the channel. rosAFE, like the Two!Ears front-end, has the parameters of Jepsen "
+        "et al. (2008), which have fewer sections of filters and other gains. Its curves coincide with the closed "
+        "form for these parameters. The distance to the dots is the difference of the two publications.",
+        tuple(panels),
+    )
+
+
+def _adaptation(process: Process) -> Published:
+    times = published.BURST_TIMES[1:]
+    panels = tuple(
+        Panel(
+            f"{level} dB SPL",
+            times,
+            np.array(values[1:]),
+            (("rosAFE", burst_response(process, level, 10.0, times)),),
+            True,
+        )
+        for level, values in published.AMT_BURST.items()
+    )
+    return Published(
+        "figures-adaptation",
+        "Adaptation loops: overshoot",
+        published.AMT_SOURCE,
+        "AMT",
+        ("time after the onset (ms)", "output (MU)"),
+        "Constant input of 500 ms. The output falls from the limited overshoot to the steady response, which is "
+        "near the level in dB.",
+        panels,
+    )
+
+
+def write_published(folder: Path, process: Process) -> list[Path]:
+    """Write figures.md and a picture of each figure into a folder, and return their paths.
+
+    Raises
+    ------
+    rosafe.output.OutputError
+        A file cannot be written.
+    """
+    figures = published_figures(process)
+    paths = []
+    for figure in figures:
+        paths.append(folder / f"{figure.name}.png")
+        _draw([(figure, panel) for panel in figure.panels], _published_panel, paths[-1])
+    page = folder / "figures.md"
+    write_whole(page, published_markdown(figures).encode())
+    return [page, *paths]
+
+
+def _published_panel(axes: Axes, pair: tuple[Published, Panel]) -> None:
+    figure, panel = pair
+    for number, (name, values) in enumerate(panel.curves):
+        axes.plot(panel.x, values, ("-", "--")[number], color=("#b3202c", "#888888")[number], linewidth=1.2, label=name)
+    axes.plot(panel.x, panel.published, ".", color="black", markersize=6, label=figure.short)
+    if panel.logarithmic:
+        axes.set_xscale("log")
+    axes.set_xlabel(figure.labels[0])
+    axes.set_ylabel(figure.labels[1])
+    axes.set_title(panel.title, fontsize=8.5)
+    axes.legend(fontsize=7.5, frameon=False)
+
+
+FIGURES_HEAD = """# Published figures
+
+Curves of publications with the same curves of rosAFE. `rosafe validate --figures FOLDER` writes this page and its
+pictures. Each figure says how its published values were obtained. [Validation](validation.md) contains the comparisons
+with tolerances.
+"""
+
+
+def published_markdown(figures: Sequence[Published]) -> str:
+    """Return the page."""
+    lines = [FIGURES_HEAD]
+    for figure in figures:
+        lines += [f"## {figure.heading}\n", f"![{figure.heading}]({figure.name}.png)\n"]
+        lines += [f"Published values: {figure.source}\n", f"{figure.remark}\n"]
+        lines += [
+            f"| panel | values | {figure.labels[0]}: {', '.join(f'{x:.4g}' for x in figure.panels[0].x)} |",
+            "|---|---|---|",
+        ]
+        for panel in figure.panels:
+            series = ((figure.short, panel.published), *(one for one in panel.curves if one[0].startswith("rosAFE")))
+            lines += [
+                f"| {panel.title} | {name} | {', '.join(f'{value:.3g}' for value in values)} |"
+                for name, values in series
+            ]
+        lines.append("")
+    return "\n".join(lines).rstrip() + "\n"

@@ -10,7 +10,17 @@ import scipy.signal
 from rosafe.declarations.literature import GARDNER_1995, KUHN_1977, WOODWORTH_1938
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization.sofa import HorizontalResponses, read_sofa
-from rosafe.validation.comparison import KEMAR, Collection, Curve, Measured, Origin, Process, scaled, shifted
+from rosafe.validation.comparison import (
+    INDEPENDENT,
+    KEMAR,
+    Collection,
+    Curve,
+    Measured,
+    Origin,
+    Process,
+    scaled,
+    shifted,
+)
 from rosafe.validation.stimuli import largest, noise
 
 ROWS = Collection()
@@ -70,7 +80,9 @@ def rendered(azimuth: float, seconds: float = 0.5) -> FloatArray:
     "dB",
     0.15,
     shifted("ild", 0.3, "dB"),
-    requires=str(KEMAR),
+    requires=(KEMAR,),
+    evidence=INDEPENDENT,
+    criterion="root mean square over directions and channels, last frame",
 )
 def head_ild(process: Process) -> Measured:
     rows = []
@@ -91,7 +103,9 @@ def head_ild(process: Process) -> Measured:
     "µs",
     10.0,
     shifted("itd", 15e-6, "s"),
-    requires=str(KEMAR),
+    requires=(KEMAR,),
+    evidence=INDEPENDENT,
+    criterion="largest difference of the median of each channel",
 )
 def head_itd(process: Process) -> Measured:
     rows = []
@@ -127,7 +141,9 @@ def _sphere(process: Process, channels: tuple[float, float], formula: FloatArray
     "parts of the ITD at 90°",
     0.1,  # a head is not a sphere
     scaled("itd", 0.75),
-    requires=str(KEMAR),
+    requires=(KEMAR,),
+    evidence=INDEPENDENT,
+    criterion="largest difference of the median over channels and frames",
 )
 def low_frequencies(process: Process) -> Measured:
     return _sphere(process, (200.0, 500.0), 3 * np.sin(np.radians(AZIMUTHS)))
@@ -140,7 +156,9 @@ def low_frequencies(process: Process) -> Measured:
     "parts of the ITD at 90°",
     0.15,
     scaled("itd", 0.75),
-    requires=str(KEMAR),
+    requires=(KEMAR,),
+    evidence=INDEPENDENT,
+    criterion="largest difference of the median over channels and frames",
 )
 def high_frequencies(process: Process) -> Measured:
     angles = np.radians(AZIMUTHS)

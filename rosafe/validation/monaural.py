@@ -18,18 +18,19 @@ from rosafe.declarations.literature import (
     PEETERS_2011,
     RABINER_1977,
     SCHADLER_2012,
-    TURGEON_2002,
 )
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface.remarks import PRESETS
 from rosafe.validation.comparison import (
+    DEFINITION,
+    INDEPENDENT,
+    STAGE,
     Collection,
     Curve,
     Measured,
     Origin,
     Process,
     altered,
-    late,
     parameter,
     scaled,
 )
@@ -49,6 +50,7 @@ RATE = 16000
     "dB per frame",
     1e-6,
     parameter("rm_decaySec", 0.0080001),
+    evidence=DEFINITION,
 )
 def ratemap_decay(process: Process) -> Measured:
     signal = np.concatenate((np.ones(1600), np.zeros(4000)))
@@ -66,6 +68,8 @@ def ratemap_decay(process: Process) -> Measured:
     "(relative)",
     1e-9,
     parameter("rm_wname", "hamming"),
+    evidence=DEFINITION,
+    criterion="last frame of 0.5 s",
 )
 def ratemap_power(process: Process) -> float:
     rates = process(through(np.full(8000, 0.3)), RATE, THROUGH, ["ratemap"])["ratemap"][0, 0]
@@ -80,6 +84,8 @@ def ratemap_power(process: Process) -> float:
     "dB",
     1e-6,
     scaled("onsetStrength", 1 + 1e-6),
+    evidence=DEFINITION,
+    criterion="frames after the start of the integrator",
 )
 def onset_sum(process: Process) -> float:
     signal = np.repeat([0.01, 0.1], 8000)
@@ -94,57 +100,12 @@ def onset_sum(process: Process) -> float:
     "dB",
     1e-6,
     parameter("rm_decaySec", 0.0080001),
+    evidence=DEFINITION,
 )
 def offset_decay(process: Process) -> float:
     signal = np.concatenate((np.ones(1600), np.zeros(1600)))
     strengths = process(through(signal), RATE, THROUGH, ["offsetStrength"])["offsetStrength"][0, 0]
     return largest(strengths[12:] - 20 * np.log10(np.e) * 0.01 / 0.008)
-
-
-ONSETS = (0.2, 0.55, 0.9, 1.3)  # s; the bursts last 0.15 s
-
-
-def bursts() -> FloatArray:
-    """Return bursts of noise at known times in a weak background, 2 s."""
-    gain = np.full(2 * RATE, 0.01)
-    for begin in ONSETS:
-        gain[round(begin * RATE) : round((begin + 0.15) * RATE)] = 1.0
-    return both(gain * noise(2 * RATE))
-
-
-def transient_error(process: Process, output: str, times: np.ndarray) -> float:
-    """Return the largest distance of a marked frame to its time, or of a time to the next marked frame, in ms."""
-    marked = process(bursts(), RATE, {"trm_minStrengthdB": 8.0}, [output])[output][0]
-    active = np.flatnonzero(marked.sum(0) >= 10)  # in a third of the channels
-    if not len(active):
-        return np.inf
-    frames = 0.01 * active + 0.01  # middle of the window
-    distances = np.abs(frames[:, None] - times)
-    return 1e3 * float(max(distances.min(0).max(), distances.min(1).max()))
-
-
-@ROWS.add(
-    "onsetMap",
-    "four bursts of noise: times of the marked frames, missed and false ones included",
-    Origin("known times; events common to neighbouring channels", TURGEON_2002),
-    "ms",
-    20.0,
-    late("onsetMap", 2),
-)
-def onset_times(process: Process) -> float:
-    return transient_error(process, "onsetMap", np.array(ONSETS))
-
-
-@ROWS.add(
-    "offsetMap",
-    "ends of four bursts of noise: times of the marked frames, missed and false ones included",
-    Origin("known times; events common to neighbouring channels", TURGEON_2002),
-    "ms",
-    30.0,  # the integrator decays for some frames
-    late("offsetMap", 2),
-)
-def offset_times(process: Process) -> float:
-    return transient_error(process, "offsetMap", np.array(ONSETS) + 0.15)
 
 
 # --- periodicity -------------------------------------------------------------------------------------------------
@@ -157,6 +118,8 @@ def offset_times(process: Process) -> float:
     "",
     1e-11,
     parameter("ac_K", 2.0000001),
+    evidence=STAGE,
+    criterion="largest difference, 6 channels of one frame",
 )
 def autocorrelation(process: Process) -> Measured:
     signal = both(complex_tone(150, range(1, 20), RATE, 0.2) + 0.1 * noise(3200))
@@ -181,6 +144,8 @@ def autocorrelation(process: Process) -> Measured:
     "",
     1e-11,
     parameter("ac_clipAlpha", 0.7),
+    evidence=STAGE,
+    criterion="largest difference of one frame",
 )
 def clipping(process: Process) -> float:
     signal = noise(3200)
@@ -204,6 +169,8 @@ def median_pitch(process: Process, signal: FloatArray) -> float:
     "samples of the period",
     0.51,  # pitch is found at whole lags
     altered("one lag more", "pitch", lambda values: 1 / (1 / values + 1 / RATE)),
+    evidence=INDEPENDENT,
+    criterion="largest difference of the median over the frames",
 )
 def pitch_of_complexes(process: Process) -> Measured:
     expected = np.array([100.0, 123, 160, 199, 240, 311, 390])
@@ -222,6 +189,8 @@ def pitch_of_complexes(process: Process) -> Measured:
     "samples of the period",
     0.51,
     altered("one lag more", "pitch", lambda values: 1 / (1 / values + 1 / RATE)),
+    evidence=INDEPENDENT,
+    criterion="largest difference of the median over the frames",
 )
 def missing_fundamental(process: Process) -> float:
     worst = 0.0
@@ -241,6 +210,7 @@ def missing_fundamental(process: Process) -> float:
     "dB",
     0.02,
     parameter("ams_cfHz", [4.0, 64.5]),
+    evidence=INDEPENDENT,
 )
 def modulation_filter(process: Process) -> Measured:
     centre, rate = 64.0, RATE / 4
@@ -264,6 +234,8 @@ def modulation_filter(process: Process) -> Measured:
     "octaves",
     0.01,
     altered("each filter exchanged for its neighbour", "amsFeatures", lambda values: np.roll(values, 1, axis=2)),
+    evidence=INDEPENDENT,
+    criterion="largest distance of the strongest filter, levels divided by the root of the bandwidth",
 )
 def modulation_frequency(process: Process) -> float:
     worst, centres = 0.0, [4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0]
@@ -283,6 +255,7 @@ def modulation_frequency(process: Process) -> float:
     "(relative)",
     1e-6,  # small constants in the denominators
     scaled("spectralFeatures", 1.00001),
+    evidence=STAGE,
 )
 def spectral_shape(process: Process) -> float:
     words = ["centroid", "spread", "crest", "flatness", "skewness", "kurtosis"]
@@ -314,6 +287,7 @@ def spectral_shape(process: Process) -> float:
     "",
     1e-6,
     scaled("spectralFeatures", 1.0001),
+    evidence=STAGE,
 )
 def spectral_entropy(process: Process) -> float:
     worst = 0.0
@@ -332,6 +306,8 @@ def spectral_entropy(process: Process) -> float:
     "features",
     0.0,
     parameter("fb_nChannels", 24),
+    evidence=DEFINITION,
+    criterion="difference of the numbers",
 )
 def gabor_count(process: Process) -> float:
     parameters = {"fb_nChannels": 23, "fb_lowFreqHz": 124.0, "fb_highFreqHz": 3657.0, "rm_wSizeSec": 0.025}
@@ -345,6 +321,7 @@ def gabor_count(process: Process) -> float:
     "dB",
     0.1,
     altered("5 % of the previous frame added", "gabor", lambda values: values + 0.05 * np.roll(values, 1, axis=-1)),
+    evidence=DEFINITION,
 )
 def gabor_filters(process: Process) -> Measured:
     step, modulations = 0.01, np.array([5.0, 12.0])

@@ -10,7 +10,17 @@ import numpy as np
 from rosafe.declarations.literature import HOHMANN_2002, LICKLIDER_1951, SLANEY_1993
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface.remarks import PRESETS
-from rosafe.validation.comparison import Collection, Curve, Measured, Origin, Process, parameter, scaled
+from rosafe.validation.comparison import (
+    INDEPENDENT,
+    STAGE,
+    Collection,
+    Curve,
+    Measured,
+    Origin,
+    Process,
+    parameter,
+    scaled,
+)
 from rosafe.validation.stimuli import both, complex_tone, largest, noise
 
 ROWS = Collection()
@@ -37,7 +47,9 @@ def channels(process: Process, signal: FloatArray, centres: Iterable[float], ban
     "(1 - r)",
     1e-5,  # filters with four zeros
     parameter("fb_bwERBs", 1.025),
-    requires="gammatone",
+    requires=("gammatone",),
+    evidence=INDEPENDENT,
+    criterion="largest 1 - r of the channels",
 )
 def slaney_filters(process: Process) -> float:
     filters = importlib.import_module("gammatone.filters")
@@ -53,7 +65,9 @@ def slaney_filters(process: Process) -> float:
     "(1 - r)",
     1e-6,
     parameter("fb_bwERBs", 1.023),
-    requires="pyfar",
+    requires=("pyfar",),
+    evidence=INDEPENDENT,
+    criterion="largest 1 - r of the channels",
 )
 def hohmann_filters(process: Process) -> float:
     pyfar = importlib.import_module("pyfar")
@@ -71,7 +85,9 @@ def hohmann_filters(process: Process) -> float:
     "of the frames",
     0.1,
     scaled("pitch", 1.03),
-    requires="librosa.core.pitch",
+    requires=("librosa.core.pitch",),
+    evidence=INDEPENDENT,
+    criterion="share of the frames, 5 at each end left out",
 )
 def pyin(process: Process) -> Measured:
     librosa = importlib.import_module("librosa")
@@ -94,7 +110,9 @@ def pyin(process: Process) -> Measured:
     "(relative)",
     1e-6,
     scaled("spectralFeatures", 1.00001),
-    requires="librosa.feature.spectral",
+    requires=("librosa.feature.spectral",),
+    evidence=STAGE,
+    criterion="largest relative difference, the first three frames left out",
 )
 def librosa_features(process: Process) -> float:
     librosa = importlib.import_module("librosa")
@@ -115,7 +133,9 @@ def librosa_features(process: Process) -> float:
     "",
     0.002,  # the window of the toolbox is periodic
     parameter("ac_K", 2.02),
-    requires="python_auditory_toolbox",
+    requires=("python_auditory_toolbox",),
+    evidence=STAGE,
+    criterion="largest difference, 8 channels of one frame, negative values set to 0",
 )
 def correlogram(process: Process) -> Measured:
     auditory_toolbox = importlib.import_module("python_auditory_toolbox.auditory_toolbox")
@@ -137,7 +157,9 @@ def correlogram(process: Process) -> Measured:
     "(1 - r)",
     1e-5,
     parameter("fb_bwERBs", 1.025),
-    requires="python_auditory_toolbox",
+    requires=("python_auditory_toolbox",),
+    evidence=INDEPENDENT,
+    criterion="largest 1 - r of the channels",
 )
 def toolbox_filters(process: Process) -> float:
     auditory_toolbox = importlib.import_module("python_auditory_toolbox.auditory_toolbox")

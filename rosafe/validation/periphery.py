@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass
 from fractions import Fraction
-from math import gamma, pi, sqrt
+from math import pi, sqrt
 
 import numpy as np
 import scipy.signal
@@ -24,6 +25,8 @@ from rosafe.declarations.literature import (
     TWOEARS_2018,
 )
 from rosafe.validation.comparison import (
+    DEFINITION,
+    INDEPENDENT,
     Collection,
     Curve,
     Disturbance,
@@ -34,6 +37,7 @@ from rosafe.validation.comparison import (
     parameter,
     scaled,
 )
+from rosafe.validation.published import AMT_BURST, BURST_TIMES
 from rosafe.validation.stimuli import THROUGH, both, fundamental, gain_db, impulse, largest, through, tone
 
 ROWS = Collection()
@@ -50,6 +54,7 @@ BUTTERWORTH = "closed form of the Butterworth filter by the bilinear transform"
     "of full scale",
     1e-9,  # libsndfile divides by 2**31, the original by 2**31 - 1
     parameter("in_normalizeValue", 2**31 + 30),
+    evidence=INDEPENDENT,
 )
 def pcm_scale(process: Process) -> float:
     import soundfile
@@ -70,6 +75,7 @@ def pcm_scale(process: Process) -> float:
     "dB",
     1e-6,
     parameter("pp_cutoffHzDC", 100.0001),
+    evidence=INDEPENDENT,
 )
 def dc_removal(process: Process) -> Measured:
     rate, cutoff = 16000.0, 100.0
@@ -88,6 +94,7 @@ def dc_removal(process: Process) -> Measured:
     "dB",
     1e-9,
     parameter("pp_refSPLdB", 94.00001),
+    evidence=DEFINITION,
 )
 def level_scale(process: Process) -> float:
     signal = both(tone(1000, 16000, 0.1, sqrt(2)))
@@ -102,6 +109,7 @@ def level_scale(process: Process) -> float:
     "dB",
     1e-9,
     parameter("pp_coefPreEmphasis", 0.97000001),
+    evidence=DEFINITION,
 )
 def pre_emphasis(process: Process) -> float:
     frequencies = np.geomspace(20, 7000, 60)
@@ -117,6 +125,8 @@ def pre_emphasis(process: Process) -> float:
     "dB",
     0.01,
     altered("a gain of each ear of its own", "preProc", lambda x: x / np.std(x, axis=-1, keepdims=True)),
+    evidence=DEFINITION,
+    criterion="largest difference of the levels of both ears in the second half of 1 s",
 )
 def gain_control(process: Process) -> float:
     signal = tone(500, 16000, 1.0, 0.03) * np.array([[1.0], [0.5]])
@@ -149,6 +159,7 @@ STAPES = {  # Hz: peak-to-peak displacement of the stapes in µm at 104 dB SPL
     "dB",
     0.5,  # the filter interpolates between the measured points
     scaled("preProc", 1.1),
+    evidence=INDEPENDENT,
 )
 def middle_ear(process: Process) -> Measured:
     rate = 44100.0
@@ -171,6 +182,7 @@ def middle_ear(process: Process) -> Measured:
     "ERB",
     0.005,  # 21.4 log10 of the publication is rounded: 9.294 in place of 9.265 ln
     parameter("fb_nERBs", 1.01),
+    evidence=INDEPENDENT,
 )
 def erb_spacing(process: Process) -> Measured:
     frequencies = process(np.zeros((2, 10)), 44100, {"fb_nERBs": 1.0}, ["gammatone"])["fb_cfHz"]
@@ -186,6 +198,7 @@ def erb_spacing(process: Process) -> Measured:
     "(relative)",
     0.005,
     parameter("fb_bwERBs", 1.03),
+    evidence=INDEPENDENT,
 )
 def bandwidths(process: Process) -> Measured:
     rate, centres = 44100.0, np.geomspace(100, 8000, 12)
@@ -206,6 +219,7 @@ def bandwidths(process: Process) -> Measured:
     "of the peak",
     1e-11,
     parameter("fb_bwERBs", 1.018 * (1 + 1e-9)),
+    evidence=DEFINITION,
 )
 def impulse_responses(process: Process) -> float:
     rate, count = 44100.0, 8000
@@ -224,6 +238,8 @@ def impulse_responses(process: Process) -> float:
     "(1 - r)",
     1e-6,
     parameter("fb_bwERBs", 1.02),
+    evidence=INDEPENDENT,
+    criterion="1 - r over 34 ms, the function in the phase of the filter",
 )
 def gammatone_function(process: Process) -> Measured:
     rate, centre = 44100.0, 1000.0
@@ -256,43 +272,77 @@ def transfer(
     return complex((section / abs(peak)) ** counts[0] * low ** counts[1])
 
 
-def drnl_output(velocities: np.ndarray, frequency: float, rate: float) -> np.ndarray:
-    """Return the level of the response of DRNL to tones at its frequency, in dB, by closed forms of both paths."""
+@dataclass(frozen=True)
+class Drnl:
+    """Parameters of a DRNL channel; `linear` and `compressive` are centre, width and cutoff of the filters in Hz.
+
+    `sections` are the numbers of gammatone and low-pass sections: of the linear path; before the compression; after it.
+    """
+
+    linear: tuple[float, float, float]
+    gain: float
+    compressive: tuple[float, float, float]
+    slope: float  # a
+    scale: float  # b
+    exponent: float  # c
+    sections: tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
+
+    def output(self, velocities: np.ndarray, frequency: float, rate: float) -> np.ndarray:
+        """Return the level of the response to tones of these peak velocities, in dB, by closed forms of both paths."""
+        direct, before, after = (
+            transfer(frequency, rate, *filters, counts)
+            for filters, counts in zip((self.linear, self.compressive, self.compressive), self.sections, strict=True)
+        )
+        wave = np.cos(2 * pi * (np.arange(4096) + 0.5) / 4096)
+        driven = velocities[:, np.newaxis] * abs(before) * np.abs(wave)
+        stick = np.sign(wave) * np.minimum(self.slope * driven, self.scale * driven**self.exponent)
+        bent = 2 * np.mean(stick * wave, axis=-1)  # the fundamental
+        return 20 * np.log10(np.abs(bent * before / abs(before) * after + velocities * self.gain * direct))
+
+
+def jepsen_drnl(frequency: float) -> Drnl:
+    """Return the parameters of Jepsen et al. (2008) of a channel."""
     fit = frequency if frequency <= 1000 else 1500.0
-    exponent = 10**-0.60206
-    linear, compressive = power_law(1.40298, 0.81916, fit), power_law(1.61912, -0.81867, fit)
-    # fundamental of sign(cos) |cos|**exponent
-    factor = 2 / sqrt(pi) * gamma(1 + exponent / 2) / gamma(1.5 + exponent / 2)
-    best, width = power_law(-0.05252, 1.0165, frequency), power_law(-0.03193, 0.7, frequency)
-    filters = transfer(frequency, rate, best, width, power_law(-0.05252, 1.01, frequency), (2, 0))
-    after = transfer(frequency, rate, best, width, power_law(-0.05252, 1.01, frequency), (2, 1))
-    driven = velocities * abs(filters)
-    knee = (compressive / linear) ** (1 / (1 - exponent))
-    stick = np.where(driven < knee, linear * driven, factor * compressive * driven**exponent)
-    nonlinear = stick * filters / abs(filters) * after
-    centre, wide = power_law(-0.06762, 1.01679, frequency), power_law(0.03728, 0.75, frequency)
-    weak = transfer(frequency, rate, centre, wide, power_law(-0.06762, 1.01, frequency), (2, 4))
-    return 20 * np.log10(np.abs(nonlinear + velocities * power_law(4.20405, -0.47909, frequency) * weak))
+    centre, cutoff = power_law(-0.06762, 1.01679, frequency), power_law(-0.06762, 1.01, frequency)
+    best, after = power_law(-0.05252, 1.0165, frequency), power_law(-0.05252, 1.01, frequency)
+    return Drnl(
+        (centre, power_law(0.03728, 0.75, frequency), cutoff),
+        power_law(4.20405, -0.47909, frequency),
+        (best, power_law(-0.03193, 0.7, frequency), after),
+        power_law(1.40298, 0.81916, fit),
+        power_law(1.61912, -0.81867, fit),
+        10**-0.60206,
+        ((2, 4), (2, 0), (2, 1)),
+    )
+
+
+def drnl_measured(process: Process, velocities: np.ndarray, frequency: float, rate: float) -> np.ndarray:
+    """Return the level of the response of the channel at a frequency to tones of these velocities, in dB."""
+    levels = []
+    for velocity in velocities:
+        signal = both(tone(frequency, rate, 0.1, velocity))
+        output = process(signal, rate, {"fb_type": "drnl", "fb_cfHz": [frequency]}, ["gammatone"])["gammatone"]
+        levels.append(20 * np.log10(abs(fundamental(output[0, 0], frequency, rate))))
+    return np.array(levels)
 
 
 @ROWS.add(
     "gammatone",
-    "DRNL: input-output curve at 4 kHz, for tones of 100 pm/s to 30 µm/s",
+    "DRNL: input-output curves from 250 Hz to 8 kHz, for tones of 100 pm/s to 30 µm/s",
     Origin("broken-stick compression of 0.25 dB/dB, parameters of Jepsen et al. (2008)", LOPEZPOVEDA_2001),
     "dB",
-    0.1,
-    parameter("fb_cfHz", [3990.0]),
+    0.01,
+    altered("output with the exponent 1.001", "gammatone", lambda values: np.sign(values) * np.abs(values) ** 1.001),
+    evidence=INDEPENDENT,
 )
 def drnl_growth(process: Process) -> Measured:
-    rate, frequency = 44100.0, 4000.0
-    velocities = 10 ** np.array([-10, -9, -8, -7, -6, -5.5, -5, -4.5])  # m/s; apart from the knee at 0.2 µm/s
-    measured = []
-    for velocity in velocities:
-        signal = both(tone(frequency, rate, 0.1, velocity))
-        output = process(signal, rate, {"fb_type": "drnl", "fb_cfHz": [frequency]}, ["gammatone"])["gammatone"]
-        measured.append(20 * np.log10(abs(fundamental(output[0, 0], frequency, rate))))
-    expected = drnl_output(velocities, frequency, rate)
-    return Measured.of(20 * np.log10(velocities), expected, measured, "input (dB re 1 m/s)", "output (dB)")
+    rate, velocities, worst = 44100.0, 10 ** np.arange(-10, -4.4, 0.5), 0.0
+    for frequency in (250.0, 500.0, 1000.0, 2000.0, 8000.0, 4000.0):
+        expected = jepsen_drnl(frequency).output(velocities, frequency, rate)
+        measured = drnl_measured(process, velocities, frequency, rate)
+        worst = max(worst, largest(measured - expected))
+    curve = Curve(20 * np.log10(velocities), expected, measured, "input at 4 kHz (dB re 1 m/s)", "output (dB)")
+    return Measured(worst, curve)
 
 
 # --- hair cells --------------------------------------------------------------------------------------------------
@@ -335,6 +385,7 @@ ROWS.add(
     "dB",
     0.001,
     other_cutoff(1.001),
+    evidence=DEFINITION,
 )(lambda process: lowpass_row(process, "dau", 2))
 ROWS.add(
     "ihc",
@@ -343,6 +394,7 @@ ROWS.add(
     "dB",
     0.001,
     other_cutoff(1.001),
+    evidence=INDEPENDENT,
 )(lambda process: lowpass_row(process, "dau1996", 1))
 
 
@@ -353,6 +405,7 @@ ROWS.add(
     "Hz",
     3.0,  # rounded in the publication
     other_cutoff(1.01),
+    evidence=INDEPENDENT,
 )
 def breebaart_cutoff(process: Process) -> float:
     frequencies = np.array([740.0, 760, 770, 780, 800])
@@ -367,6 +420,7 @@ def breebaart_cutoff(process: Process) -> float:
     "dB",
     0.01,
     altered("output with the exponent 1.001", "ihc", lambda values: values**1.001),
+    evidence=INDEPENDENT,
 )
 def bernstein_growth(process: Process) -> Measured:
     levels = np.arange(-60.0, 1, 10)
@@ -386,6 +440,7 @@ def bernstein_growth(process: Process) -> Measured:
     "of the depth",
     1e-3,
     altered("envelope with the exponent 1.01", "ihc", lambda values: values**1.01),
+    evidence=DEFINITION,
 )
 def modulation_depth(process: Process) -> float:
     rate, centre, modulation, depth = 32000.0, 4000.0, 20.0, 0.5
@@ -428,6 +483,8 @@ def adapted(process: Process, seconds: float, limit: float) -> np.ndarray:
     "MU",
     0.01,
     scaled("adaptation", 1.001),
+    evidence=INDEPENDENT,
+    criterion="largest difference of the response after 8 s",
 )
 def adapted_growth(process: Process) -> Measured:
     measured = adapted(process, 8.0, 0.0)[:, 1]
@@ -442,11 +499,38 @@ def adapted_growth(process: Process) -> Measured:
     "(relative)",
     1e-9,
     parameter("adpt_mindB", 1e-6),
+    evidence=INDEPENDENT,
 )
 def overshoot(process: Process) -> float:
     measured = adapted(process, 0.001, 0.0)[1:, 0]
     expected = model_units(10 ** ((LEVELS - 100) / 20) / LEAST ** (31 / 32))[1:]
     return largest(measured / expected - 1)
+
+
+def burst_response(process: Process, level: float, limit: float, times: np.ndarray) -> np.ndarray:
+    """Return the response (T,) in model units at times (T,) in ms after the onset of 500 ms at a constant level."""
+    signal = np.zeros(19200)
+    signal[1600:9600] = 10 ** ((level - 100) / 20)
+    output = process(through(signal), 16000, {**THROUGH, "adpt_lim": limit}, ["adaptation"])["adaptation"][0, 0]
+    return np.asarray(output[1600 + np.round(16 * times).astype(int)])
+
+
+@ROWS.add(
+    "adaptation",
+    "response to constant input of 500 ms at 20, 60 and 100 dB SPL, limit 10, from 0 to 499 ms after the onset",
+    Origin("`comp_adaptloop` of AMT 0.9.9, computed with GNU Octave", MAJDAK_2022),
+    "MU",
+    1e-3,  # eight digits are kept
+    parameter("adpt_lim", 10.0001),
+    evidence=INDEPENDENT,
+)
+def adapted_burst(process: Process) -> Measured:
+    measured = [burst_response(process, level, 10.0, BURST_TIMES) for level in AMT_BURST]
+    worst = largest(np.subtract(measured, list(AMT_BURST.values())))
+    times = BURST_TIMES[1:]
+    return Measured(
+        worst, Curve(times, AMT_BURST[60][1:], measured[1][1:], "time after onset (ms)", "output (MU)", True)
+    )
 
 
 @ROWS.add(
@@ -456,6 +540,7 @@ def overshoot(process: Process) -> float:
     "(relative)",
     1e-9,
     parameter("adpt_lim", 10.000001),
+    evidence=DEFINITION,
 )
 def limited_overshoot(process: Process) -> Measured:
     measured = adapted(process, 0.001, 10.0)[:, 0]
@@ -478,6 +563,7 @@ def limited_overshoot(process: Process) -> Measured:
     "dB",
     1e-9,
     scaled("moc", 1 + 1e-9),
+    evidence=DEFINITION,
 )
 def efferent_attenuation(process: Process) -> Measured:
     levels, measured = [], []

@@ -12,25 +12,35 @@ from typing import Any
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.offline.process import process
 from rosafe.offline.result import Result
-from rosafe.validation import binaural, kemar, monaural, peers, periphery
-from rosafe.validation.comparison import Comparison, Curve, Measured
+from rosafe.validation import binaural, kemar, monaural, peers, periphery, systems, transients
+from rosafe.validation.comparison import (
+    DEFINITION,
+    INDEPENDENT,
+    LIMITATION,
+    STAGE,
+    Comparison,
+    Curve,
+    Measured,
+    Process,
+)
 from rosafe.version import VERSION
 
 
 def comparisons(short: bool = False) -> list[Comparison]:
     """Return all comparisons, or those of the short form, by the order of the chain."""
-    modules = (periphery, monaural, binaural, kemar, peers)
+    modules = (periphery, monaural, transients, binaural, kemar, systems, peers)
     return [row for module in modules for row in module.ROWS.comparisons if row.short or not short]
 
 
 @dataclass(frozen=True)
 class Row:
-    """The result of one comparison."""
+    """The result of one comparison; `parameters` is the text of those with which the function under test was called."""
 
     comparison: Comparison
     deviation: float = math.nan
     curve: Curve | None = None
     seconds: float = 0.0
+    parameters: str = ""
 
     @property
     def skipped(self) -> bool:
@@ -81,10 +91,47 @@ def _run_one(comparison: Comparison, disturbed: bool) -> Row:
     if comparison.missing:
         return Row(comparison)
     begin = time.monotonic()
-    measured = comparison.measure(comparison.disturbance.change(compute) if disturbed else compute)
+    calls: list[tuple[float, Mapping[str, Any]]] = []
+    under_test = recorded(comparison.under_test or compute, calls)
+    if disturbed and comparison.disturbance:
+        under_test = comparison.disturbance.change(under_test)
+    measured = comparison.measure(under_test)
     if not isinstance(measured, Measured):
         measured = Measured(measured)
-    return Row(comparison, float(measured.deviation), measured.curve, time.monotonic() - begin)
+    seconds = time.monotonic() - begin
+    return Row(comparison, float(measured.deviation), measured.curve, seconds, parameters_text(calls))
+
+
+def recorded(under_test: Process, calls: list[tuple[float, Mapping[str, Any]]]) -> Process:
+    """Return a function that appends the sample rate and the parameters of each call to `calls`."""
+
+    def run(signal: Any, rate: float, parameters: Mapping[str, Any], outputs: Sequence[str]) -> Any:
+        calls.append((rate, parameters))
+        return under_test(signal, rate, parameters, outputs)
+
+    return run
+
+
+def parameters_text(calls: Sequence[tuple[float, Mapping[str, Any]]]) -> str:
+    """Return the sample rates and parameters of calls as Markdown: `name` = value; of several values the extremes."""
+    rates = sorted({f"{rate / 1000:g} kHz" for rate, _ in calls})
+    names = list(dict.fromkeys(name for _, parameters in calls for name in parameters))
+    texts = [
+        f"`{name}` = {_values([parameters[name] for _, parameters in calls if name in parameters])}" for name in names
+    ]
+    return "; ".join([" or ".join(rates), *(texts or ["defaults"])])
+
+
+def _values(values: Sequence[Any]) -> str:
+    texts = list(dict.fromkeys(_value(value) for value in values))
+    return texts[0] if len(texts) == 1 else f"{texts[0]} ... {texts[-1]}"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        items = [_value(item) for item in value]
+        return ", ".join(items if len(items) < 6 else [*items[:2], "...", items[-1]])
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def line(row: Row, disturbed: bool = False) -> str:
@@ -93,6 +140,8 @@ def line(row: Row, disturbed: bool = False) -> str:
     name = f"{comparison.kind}: {comparison.subject}"
     if row.skipped:
         return f"{'skipped':12}{name}: {comparison.missing}"
+    if not comparison.disturbance:
+        return f"{'reported':12}{name}: {_amount(row)}"
     verdict = "detected" if disturbed else "pass"
     if row.passed is disturbed:
         verdict = "NOT DETECTED" if disturbed else "FAIL"
@@ -102,8 +151,9 @@ def line(row: Row, disturbed: bool = False) -> str:
 
 HEAD = """# Validation
 
-Each representation is compared with something that is not part of rosAFE: published formulas and values, closed forms,
-the measured head KEMAR, and other toolboxes. This page is written by the last of these commands:
+This page compares numbers of rosAFE with expected numbers. The tables separate the comparisons by the origin of the
+expected number, because only the first kind shows that a representation is right. The last of these commands writes
+the page:
 
 ```sh
 rosafe validate                        # a line for each comparison; without network
@@ -112,10 +162,42 @@ rosafe validate --self-test            # each comparison has to detect a small e
 rosafe validate -o validation.md       # this page and its pictures
 ```
 
+"Parameters" are recorded from the calls of the function under test: the sample rates, and each parameter that is not a
+default. If the calls differ in a parameter, its first and last values are shown. "Criterion" says how the deviation
+is computed. "Error" is the one that `--self-test` introduces, and the deviation with it, which has to exceed
+the tolerance.
+
 Comparisons with other toolboxes are skipped if these are not installed; `pip install gammatone pyfar librosa
-python-auditory-toolbox` installs all of them. KEMAR needs Debian's libmysofa1 and h5py. "Disturbance" is the
-error that `--self-test` introduces. The last column is the deviation with it, which has to exceed the tolerance.
+python-auditory-toolbox` installs all of them. KEMAR needs Debian's libmysofa1 and h5py, the talkers alsa-utils.
+[Published figures](figures.md) shows curves of publications with the same curves of rosAFE.
 """
+
+SECTIONS = {
+    INDEPENDENT: """## Independent comparisons
+
+The expected number comes from a publication, a closed form, a measurement, another program, or a sound whose property
+is known. An error in any stage of the chain shows.
+""",
+    STAGE: """## One stage alone
+
+Another program computes the stage from the project's own input of that stage, which is an output of the stage before.
+An error of that stage shows; an error of an earlier stage does not.
+""",
+    DEFINITION: """## Own definition
+
+The expected number follows from the definition that rosAFE, or the original Two!Ears front-end, has chosen. These
+comparisons show that the program computes its definition. They do not show that the definition is right.
+""",
+    LIMITATION: """## Limitations
+
+These numbers have no tolerance and count neither as passed nor as failed. They show how far the representations can be
+trusted, mostly with the original's defaults. [Onset maps](onset-maps.md) describes the first ones.
+""",
+}
+TABLE = """| representation | quantity | reference | parameters | criterion | deviation | tolerance | passed | error |
+|---|---|---|---|---|--:|--:|---|---|"""
+LIMITATIONS_TABLE = """| representation | quantity | reference | parameters | criterion | value |
+|---|---|---|---|---|--:|"""
 
 
 def markdown(rows: Sequence[Row], disturbed: Sequence[Row], pictures: Mapping[str, str]) -> str:
@@ -124,42 +206,50 @@ def markdown(rows: Sequence[Row], disturbed: Sequence[Row], pictures: Mapping[st
     Parameters
     ----------
     rows, disturbed : sequence of Row
-        The results without and with disturbances.
+        The results without disturbances, and those with them.
     pictures : mapping of str to str
         The names of the pictures by their descriptions.
     """
-    checked = [row for row in rows if not row.skipped]
-    passed = sum(row.passed for row in checked)
-    kinds = len({row.comparison.kind for row in checked})
-    lines = [
-        HEAD,
-        f"Version {VERSION}: {passed} of {len(checked)} comparisons passed, of {kinds} representations; "
-        f"{len(rows) - len(checked)} were skipped.\n",
-        "| representation | quantity | reference | deviation | tolerance | passed | disturbance | deviation with it |",
-        "|---|---|---|--:|--:|---|---|--:|",
-        *(_markdown_row(*pair) for pair in zip(rows, disturbed, strict=True)),
-        "",
-        *(f"![{text}]({name})\n" for text, name in pictures.items()),
-    ]
+    errors = {row.comparison: row for row in disturbed}
+    lines = [HEAD, f"Version {VERSION}: {_summary(rows)}\n"]
+    for evidence, introduction in SECTIONS.items():
+        members = [row for row in rows if row.comparison.evidence == evidence]
+        if not members:
+            continue
+        table = LIMITATIONS_TABLE if evidence == LIMITATION else TABLE
+        lines += [introduction, table, *(_markdown_row(row, errors.get(row.comparison)) for row in members), ""]
+    lines += ["## Pictures\n", *(f"![{text}]({name})\n" for text, name in pictures.items())]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _summary(rows: Sequence[Row]) -> str:
+    parts = []
+    for evidence, name in {
+        INDEPENDENT: "independent comparisons",
+        STAGE: "of one stage",
+        DEFINITION: "of the own definition",
+    }.items():
+        members = [row for row in rows if row.comparison.evidence == evidence and not row.skipped]
+        parts.append(f"{sum(row.passed for row in members)} of {len(members)} {name}")
+    return f"{', '.join(parts)} passed; {sum(row.skipped for row in rows)} were skipped."
 
 
 def _amount(row: Row) -> str:
     return f"{row.deviation:.2g} {row.comparison.unit}".rstrip()
 
 
-def _markdown_row(row: Row, disturbed: Row) -> str:
+def _markdown_row(row: Row, disturbed: Row | None) -> str:
     comparison = row.comparison
-    verdict = "" if row.skipped else "yes" if row.passed else "**no**"
-    error = "" if disturbed.skipped else f"{disturbed.deviation:.2g}"
-    cells = (
+    cells = [
         f"`{comparison.kind}`",
         comparison.subject,
         comparison.source.markdown,
+        row.parameters,
+        comparison.criterion,
         "skipped" if row.skipped else _amount(row),
-        f"{comparison.tolerance:g}",
-        verdict,
-        comparison.disturbance.text,
-        error,
-    )
+    ]
+    if comparison.disturbance:
+        verdict = "" if row.skipped else "yes" if row.passed else "**no**"
+        error = "" if disturbed is None or disturbed.skipped else f": {disturbed.deviation:.2g}"
+        cells += [f"{comparison.tolerance:g}", verdict, comparison.disturbance.text + error]
     return f"| {' | '.join(cells)} |"
