@@ -224,7 +224,12 @@ these filters for both ears; the one with the largest correlation is used. Its c
 weight
 $W(f)$ of Stern et al. (1988); `precedence_itd` is the lag of its maximum, and `precedence_ild` the ratio of the
 energies
-in dB.""",
+in dB.
+
+Where it holds: with the defaults, the lead dominates for an echo of -6 dB after 1 to 8 ms, and of -3 dB up to about
+5 ms; with `prec_wSizeSec` = 0.05, of -3 dB up to 8 ms. For an echo of equal level it holds in part, best at 3 ms. If
+the echo is louder, the results follow the echo. The model of Braasch (2013) finds the lead in all of these cases: it
+analyses the whole sound at once. [Published figures](../figures.md) compares both.""",
         "noise = 0.1 * np.random.default_rng(1).standard_normal(rate)\n"
         "lead = np.stack([np.roll(noise, 6), noise])  # from the right\n"
         "lag = 0.8 * np.roll(lead[::-1], 48, axis=1)  # an echo from the left after 3 ms\n"
@@ -264,7 +269,10 @@ with $D$ = `ofs_maxOffsetdB`. It is 0 in the first frame.""",
    frame rate $\rho$;
 3. and part of a fragment of at least $s$ = `trm_minSpread` adjacent peaks, including diagonal ones.
 
-Frame $k$ depends on the frames from $k - H$ to $k + H$, $H = 2 q + s - 1$, so that it is $H$ frames late.""",
+Frame $k$ depends on the frames from $k - H$ to $k + H$, $H = 2 q + s - 1$, so that it is $H$ frames late.
+
+The defaults mark fluctuations of steady noise, too. [Onset maps](../onset-maps.md) shows their errors, and the preset
+`onsets`.""",
         _BURSTS,
         'units = result["onsetMap"][0].sum(axis=0)\nseconds = result["onsetMap_time"]\n'
         'print("onsets at", sorted({round(float(second), 2) for second in seconds[units >= 8]}), "s")',
@@ -274,7 +282,9 @@ Frame $k$ depends on the frames from $k - H$ to $k + H$, $H = 2 q + s - 1$, so t
         r"""The same as the [onset map](onsetMap.md), for offset strengths: a unit is 1 if its offset strength is a
 peak in
 time of at least `trm_minStrengthdB`, the strongest within `trm_fuseWithinSec`, and part of a fragment of at least
-$s$ = `trm_minSpread` adjacent peaks. It is $H = 2 q + s - 1$ frames late.""",
+$s$ = `trm_minSpread` adjacent peaks. It is $H = 2 q + s - 1$ frames late.
+
+[Onset maps](../onset-maps.md) shows the errors of the defaults, and the preset `onsets`.""",
         _BURSTS,
         'units = result["offsetMap"][0].sum(axis=0)\nseconds = result["offsetMap_time"]\n'
         'print(f"most units at {seconds[units.argmax()]:.2f} s")',

@@ -49,6 +49,9 @@ speech, 82 to 94 % of the frames that `pyin` takes as voiced are within 50 cents
 (espeak-ng es+f1), 45 % of these frames are an octave below `pyin`. The defaults, which are those of the original, suit
 pitches above 150 Hz.
 
+`onsets`: onset and offset maps without marks in steady noise and in muted inputs. docs/onset-maps.md has its errors and
+those of the defaults.
+
 | preset | parameter | value |
 | --- | --- | --- |"""
 

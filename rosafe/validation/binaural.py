@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import scipy.signal
 
@@ -253,13 +255,14 @@ def lateral_itd(process: Process, delay: float, level: float, window: float) -> 
     return float(np.mean(found))
 
 
-def _against_model(process: Process, level: float, window: float) -> Measured:
+def against_model(process: Process, level: int, window: float) -> Measured:
+    """Compare the ITD for all delays with the published model."""
     expected = 1e3 * np.array(BRAASCH_ITD[level])
     measured = [1e3 * lateral_itd(process, float(delay), level, window) for delay in BRAASCH_DELAYS]
     return Measured.of(BRAASCH_DELAYS, expected, measured, "delay of the lag (ms)", "ITD (µs)")
 
 
-MODEL = Origin("program of the author, computed with GNU Octave; see figures.md", BRAASCH_2013)
+MODEL = Origin("transcription of the author's program, computed with GNU Octave (docs/figures.md)", BRAASCH_2013)
 CENTROID = "largest difference of the centroid of the correlation, over delays of 1 to 8 ms"
 for _level, _window, _tolerance in ((-6, 0.02, 100.0), (-3, 0.05, 100.0)):
     ROWS.add(
@@ -271,7 +274,7 @@ for _level, _window, _tolerance in ((-6, 0.02, 100.0), (-3, 0.05, 100.0)):
         altered("correlation shifted by 10 lags", "precedence_cc", lambda values: np.roll(values, 10, axis=1)),
         evidence=INDEPENDENT,
         criterion=CENTROID,
-    )(lambda process, level=_level, window=_window: _against_model(process, level, window))
+    )(partial(against_model, level=_level, window=_window))
 for _level, _window in ((-3, 0.02), (0, 0.02), (0, 0.05), (4, 0.05)):
     _words = "equal level" if not _level else f"{_level:+d} dB"
     ROWS.limitation(
@@ -280,4 +283,4 @@ for _level, _window in ((-3, 0.02), (0, 0.02), (0, 0.05), (4, 0.05)):
         MODEL,
         "µs",
         criterion=CENTROID,
-    )(lambda process, level=_level, window=_window: _against_model(process, level, window))
+    )(partial(against_model, level=_level, window=_window))

@@ -16,10 +16,9 @@ import numpy as np
 from rosafe.declarations.reference import Reference
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.numeric_limits import FloatArray
-from rosafe.validation.stimuli import largest
+from rosafe.validation.stimuli import TALKERS, largest
 
 KEMAR = "/usr/share/libmysofa/default.sofa"  # measured responses of MIT KEMAR
-TALKERS = ("/usr/share/sounds/alsa/Front_Center.wav", "/usr/share/sounds/alsa/Rear_Right.wav")  # recorded words
 PACKAGES = {KEMAR: "libmysofa1", **dict.fromkeys(TALKERS, "alsa-utils")}  # of Debian
 
 # What a comparison is evidence of. The order is that of the page.
@@ -152,7 +151,7 @@ class Comparison:
     @property
     def group(self) -> str:
         """The name of the module that defines it."""
-        return self.measure.__module__.rpartition(".")[2]
+        return getattr(self.measure, "func", self.measure).__module__.rpartition(".")[2]
 
     @property
     def missing(self) -> str:

@@ -86,7 +86,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Published:
-    """A figure: the name of its file, heading, source and short name of the published values, labels, remark, panels."""
+    """A figure: name of its file, heading, source and short name of the published values, labels, remark, panels."""
 
     name: str
     heading: str

@@ -518,7 +518,7 @@ def burst_response(process: Process, level: float, limit: float, times: np.ndarr
 @ROWS.add(
     "adaptation",
     "response to constant input of 500 ms at 20, 60 and 100 dB SPL, limit 10, from 0 to 499 ms after the onset",
-    Origin("`comp_adaptloop` of AMT 0.9.9, computed with GNU Octave", MAJDAK_2022),
+    Origin("transcription of `comp_adaptloop` of AMT 0.9.9, computed with GNU Octave (docs/figures.md)", MAJDAK_2022),
     "MU",
     1e-3,  # eight digits are kept
     parameter("adpt_lim", 10.0001),

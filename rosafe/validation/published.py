@@ -14,7 +14,7 @@ BRAASCH_SOURCE = (
     "concerns the values at 4 dB, and some of those at equal level."
 )
 BRAASCH_DELAYS = np.arange(1, 9)
-BRAASCH_ITD = {
+BRAASCH_ITD: dict[int, tuple[float, ...]] = {
     -6: (0.1920, 0.2807, 0.2783, 0.2789, 0.2660, 0.2842, 0.2892, 0.2837),
     -3: (0.1867, 0.2784, 0.2755, 0.2821, 0.2590, 0.2844, 0.2813, 0.2862),
     0: (0.2460, 0.2990, 0.2344, 0.2535, 0.3010, 0.2858, 0.2806, 0.3180),

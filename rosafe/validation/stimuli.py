@@ -12,6 +12,17 @@ from rosafe.dsp.numeric_limits import FloatArray
 # Parameters with which hair cells output twice the signal: a filter without memory (exp(-30) at 16 kHz)
 THROUGH = {"fb_cfHz": [7000.0], "fb_nGamma": 1, "fb_bwERBs": 100.0, "ihc_method": "none"}
 
+TALKERS = ("/usr/share/sounds/alsa/Front_Center.wav", "/usr/share/sounds/alsa/Rear_Right.wav")  # recorded words
+
+
+def talker(number: int) -> FloatArray:
+    """Return 1.2 s of a recorded voice (N,) at 16 kHz, with a standard deviation of 0.02."""
+    import soundfile
+
+    sound, rate = soundfile.read(TALKERS[number])
+    sound = scipy.signal.resample_poly(sound, 16000, rate)[:19200]
+    return np.asarray(0.02 * sound / np.std(sound))
+
 
 def both(signal: Any) -> FloatArray:
     """Return the same signal at both ears, (2, N)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from rosafe.declarations.literature import TURGEON_2002
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface.remarks import PRESETS
 from rosafe.validation.comparison import INDEPENDENT, Collection, Origin, Process, late
-from rosafe.validation.stimuli import both, noise, tone
+from rosafe.validation.stimuli import TALKERS, both, noise, talker, tone
 
 ROWS = Collection()
 RATE = 16000
@@ -24,13 +25,13 @@ STEADY = "steady white noise of 0.1"
 SPARSE = "samples of 0 and, one in a thousand, 1 of a 16-bit converter"
 
 
-def gated(sound: FloatArray) -> FloatArray:
-    """Return a sound (N,) during the events, with ramps of 5 ms, in noise 60 dB below a sound of 0.1, (2, N)."""
+def gated(sound: FloatArray, background: float = 1e-3) -> FloatArray:
+    """Return a sound (N,) during the events, with ramps of 5 ms, in noise of 0.1 times the background, (2, N)."""
     gain = np.zeros(len(sound))
     for begin in TIMES:
         gain[round(begin * RATE) : round((begin + DURATION) * RATE)] = 1.0
     ramp = np.hanning(2 * 80)
-    return both(np.convolve(gain, ramp / ramp.sum(), "same") * sound + 1e-3 * noise(len(sound), 2))
+    return both(np.convolve(gain, ramp / ramp.sum(), "same") * sound + background * noise(len(sound), 2))
 
 
 def clicks() -> FloatArray:
@@ -43,6 +44,20 @@ def clicks() -> FloatArray:
 def sparse() -> FloatArray:
     """Return a muted input whose last bit toggles, (2, N)."""
     return both((np.random.default_rng(3).random(SECONDS * RATE) < 1e-3) / 32768)
+
+
+def excerpts() -> FloatArray:
+    """Return pieces of two recorded voices at the times of the events, in noise 40 dB below, (2, N)."""
+    voices = np.concatenate([talker(number) for number in (0, 1)])
+    count = round(DURATION * RATE)
+    levels = np.sqrt(np.convolve(voices**2, np.full(count, 1 / count), "valid"))
+    loud, random = np.flatnonzero(levels > np.percentile(levels, 60)), np.random.default_rng(1)
+    sound = np.zeros(SECONDS * RATE)
+    for begin in np.round(TIMES * RATE).astype(int):
+        first = random.choice(loud)
+        piece = voices[first : first + count]
+        sound[begin : begin + count] = 0.1 * piece / np.std(piece)
+    return gated(sound, 1e-2)
 
 
 def marked(process: Process, sound: FloatArray, output: str, parameters: Mapping[str, Any]) -> FloatArray:
@@ -120,3 +135,32 @@ for _output in ("onsetMap", "offsetMap"):
 )
 def defaults_distance(process: Process) -> float:
     return worst(marked(process, bursts(), "onsetMap", {}), TIMES)
+
+
+def missed(process: Process, parameters: Mapping[str, Any]) -> float:
+    """Return the share of the excerpts of speech without a mark."""
+    frames = marked(process, excerpts(), "onsetMap", parameters)
+    return float(np.mean(np.abs(frames[:, np.newaxis] - TIMES).min(axis=0) > NEAR))
+
+
+def inside(process: Process, parameters: Mapping[str, Any]) -> float:
+    """Return the number of groups of marks away from the beginnings of the excerpts of speech, per second."""
+    frames = marked(process, excerpts(), "onsetMap", parameters)
+    away = frames[np.abs(frames[:, np.newaxis] - TIMES).min(axis=1) > NEAR]
+    return float(np.sum(np.diff(away, prepend=-1.0) > NEAR)) / SECONDS
+
+
+EXCERPTS = "18 excerpts of recorded voices in noise 40 dB below"
+for _name, _parameters in (("defaults", {}), ("preset `onsets`", PRESET)):
+    for _measure, _unit, _criterion in (
+        (missed, "of the events", f"share of the events without a mark within {1e3 * NEAR:g} ms"),
+        (inside, "per second", f"groups of marked frames that are more than {1e3 * NEAR:g} ms from an event"),
+    ):
+        ROWS.limitation(
+            "onsetMap",
+            f"{_name}: {EXCERPTS}",
+            Origin("known times of the excerpts"),
+            _unit,
+            criterion=_criterion,
+            requires=TALKERS,
+        )(partial(_measure, parameters=_parameters))
