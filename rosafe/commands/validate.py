@@ -54,16 +54,7 @@ def run(options: argparse.Namespace) -> int:
     """Run the comparisons and print or write their results."""
     if options.figures:
         return _write_figures(options)
-    target = Path(options.to) if options.to else None
-    if target and options.self_test:
-        options.usage_error("-o: expected without --self-test, whose results the page contains as well, got both")
-    if target and target.suffix.lower() != ".md":
-        raise CommandError(f"-o: expected a name ending in .md, got {target}")
-    if target and not target.parent.is_dir():
-        raise CommandError(f"{target}: expected an existing folder {target.parent}")
-    if target:
-        check_target(target, True)
-        require("matplotlib", "pictures")
+    target = _target(options)
     from rosafe.validation import report
 
     begin, disturbed = time.monotonic(), options.self_test
@@ -77,6 +68,22 @@ def run(options: argparse.Namespace) -> int:
     if target:
         _write(target, rows, report.run((row for row in comparisons if row.disturbance), disturbed=True))
     return 0 if good == len(computed) else 1
+
+
+def _target(options: argparse.Namespace) -> Path | None:
+    """Return the checked path of the page, or None."""
+    if not options.to:
+        return None
+    target = Path(options.to)
+    if options.self_test:
+        options.usage_error("-o: expected without --self-test, whose results the page contains as well, got both")
+    if target.suffix.lower() != ".md":
+        raise CommandError(f"-o: expected a name ending in .md, got {target}")
+    if not target.parent.is_dir():
+        raise CommandError(f"{target}: expected an existing folder {target.parent}")
+    check_target(target, True)
+    require("matplotlib", "pictures")
+    return target
 
 
 def _write_figures(options: argparse.Namespace) -> int:

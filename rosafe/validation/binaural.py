@@ -240,7 +240,8 @@ def lead_lag(delay: float, level: float, seed: int) -> FloatArray:
 def lateral_itd(process: Process, delay: float, level: float, window: float) -> float:
     """Return the ITD of the published decision device in ms, mean of three noises.
 
-    It is the centroid of the correlation, summed over channels and frames, where this exceeds half of its maximum.
+    It is the centroid of those parts of the correlation, summed over channels and frames, that exceed half of its
+    maximum.
     """
     found = []
     parameters = {"fb_lowFreqHz": 100.0, "fb_highFreqHz": 1400.0, "prec_wSizeSec": window, "prec_hSizeSec": window / 2}

@@ -21,11 +21,11 @@ from rosafe.validation.stimuli import TALKERS, largest
 KEMAR = "/usr/share/libmysofa/default.sofa"  # measured responses of MIT KEMAR
 PACKAGES = {KEMAR: "libmysofa1", **dict.fromkeys(TALKERS, "alsa-utils")}  # of Debian
 
-# What a comparison is evidence of. The order is that of the page.
+# The evidence that a comparison provides. The order is that of the page.
 INDEPENDENT = "independent"  # the expected numbers come from a publication, a closed form, a measurement or a program
 STAGE = "stage"  # another program computes one stage from the project's own input of that stage
 DEFINITION = "definition"  # the expected numbers follow from the definition that the project itself has chosen
-LIMITATION = "limitation"  # a number is reported; there is no tolerance
+LIMITATION = "limitation"  # a number is reported without a tolerance
 
 Process = Callable[[Any, float, Mapping[str, Any], Sequence[str]], Any]
 Change = Callable[[Process], Process]

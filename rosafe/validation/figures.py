@@ -123,15 +123,15 @@ def _precedence(process: Process) -> Published:
         published.BRAASCH_SOURCE,
         "program of Braasch (2013)",
         ("delay of the lag (ms)", "ITD (ms)"),
-        "Noise of 200 ms from 100 to 900 Hz; the lead has an ITD of 0.3 ms, the lag one of -0.3 ms. The ITD is "
-        "the centroid of the correlation, summed over channels and frames, where it exceeds half of its maximum. "
-        "The author's program analyses the whole sound at once, normalises the four correlations between which it "
-        "chooses, and sums correlations weighted by energy. `precedence`, like the Two!Ears front-end, analyses "
-        "frames of `prec_wSizeSec`, compares correlations that are not normalised, and outputs normalised "
+        "Noise of 200 ms from 100 to 900 Hz; the lead has an ITD of 0.3 ms, the lag one of -0.3 ms. The ITD is the "
+        "centroid of those parts of the correlation, summed over channels and frames, that exceed half of its "
+        "maximum. The author's program analyses the whole sound at once, normalises the four correlations between "
+        "which it chooses, and sums correlations weighted by energy. `precedence`, like the Two!Ears front-end, "
+        "analyses frames of `prec_wSizeSec`, compares correlations that are not normalised, and outputs normalised "
         "correlations. So the lead dominates for a lag of -6 dB, and with windows of 50 ms for a lag of -3 dB. "
         "With the default windows of 20 ms, it holds at -3 dB up to delays of about 5 ms. At equal level it holds "
         "in part, best at 3 ms; with the default windows, the ITD is near 0 from 6 ms on. If the lag is louder, "
-        "rosAFE follows the lag and the published model the lead.",
+        "rosAFE follows the lag with the default windows, and the author's program the lead.",
         tuple(panels),
     )
 

@@ -276,7 +276,7 @@ def transfer(
 class Drnl:
     """Parameters of a DRNL channel; `linear` and `compressive` are centre, width and cutoff of the filters in Hz.
 
-    `sections` are the numbers of gammatone and low-pass sections: of the linear path; before the compression; after it.
+    `sections` are the numbers of gammatone and low-pass sections in the linear path, before and after the compression.
     """
 
     linear: tuple[float, float, float]

@@ -226,8 +226,8 @@ def _summary(rows: Sequence[Row]) -> str:
     parts = []
     for evidence, name in {
         INDEPENDENT: "independent comparisons",
-        STAGE: "of one stage",
-        DEFINITION: "of the own definition",
+        STAGE: "single stages",
+        DEFINITION: "own definitions",
     }.items():
         members = [row for row in rows if row.comparison.evidence == evidence and not row.skipped]
         parts.append(f"{sum(row.passed for row in members)} of {len(members)} {name}")

@@ -174,7 +174,7 @@ def test_written_page(few: list[Comparison], tmp_path: Path) -> None:
     page = tmp_path / "out.md"
     assert main(["validate", "-o", str(page)]) == 0
     text = page.read_text("utf-8")
-    assert "1 of 1 independent comparisons, 0 of 0 of one stage, 1 of 1 of the own definition passed; 1 were" in text
+    assert "1 of 1 independent comparisons, 0 of 0 single stages, 1 of 1 own definitions passed; 1 were" in text
     assert text.index("## Independent comparisons") < text.index("## Own definition") < text.index("## Limitations")
     assert text.count("\n| `") == 4
     assert "| 16 kHz; defaults | largest difference over all channels and frames |" in text  # ild
@@ -218,7 +218,7 @@ def test_published_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 def test_published_values_and_curves_agree() -> None:
-    """Adaptation follows AMT, and the lead dominates as in the published model where the page says so."""
+    """Adaptation follows AMT; for weak lags, the lead dominates as in the published model."""
     precedence, drnl, adaptation = figures.published_figures(report.compute)
     for panel in adaptation.panels:
         assert panel.curves[0][1] == pytest.approx(panel.published, abs=1e-3)
