@@ -225,13 +225,15 @@ def markdown(rows: Sequence[Row], disturbed: Sequence[Row], pictures: Mapping[st
 def _summary(rows: Sequence[Row]) -> str:
     parts = []
     for evidence, name in {
-        INDEPENDENT: "independent comparisons",
+        INDEPENDENT: "independent",
         STAGE: "single stages",
         DEFINITION: "own definitions",
     }.items():
         members = [row for row in rows if row.comparison.evidence == evidence and not row.skipped]
         parts.append(f"{sum(row.passed for row in members)} of {len(members)} {name}")
-    return f"{', '.join(parts)} passed; {sum(row.skipped for row in rows)} were skipped."
+    checked = [row for row in rows if row.comparison.disturbance and not row.skipped]
+    total = f"{sum(row.passed for row in checked)} of {len(checked)} comparisons passed"
+    return f"{total} ({', '.join(parts)}); {sum(row.skipped for row in rows)} were skipped."
 
 
 def _amount(row: Row) -> str:

@@ -56,8 +56,8 @@ def test_pictures_exist() -> None:
 
 def test_figures_are_those_of_the_measurements() -> None:
     validation = (ROOT / "docs" / "validation.md").read_text("utf-8")
-    passed = re.search(r"(\d+) of \1 comparisons passed", validation)
-    assert passed and f"All {passed[1]} comparisons pass" in BODY
+    passed = re.search(r"(\d+ of \d+ comparisons) passed", validation)
+    assert passed and f"{passed[1]} pass" in BODY
     table = re.findall(r"^\| [^|]* \| [^|]* \| ([^|]*) \|$", BODY, re.MULTILINE)[1:]
     assert len(table) == 7
     for value in table:
