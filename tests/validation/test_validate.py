@@ -174,7 +174,9 @@ def test_written_page(few: list[Comparison], tmp_path: Path) -> None:
     page = tmp_path / "out.md"
     assert main(["validate", "-o", str(page)]) == 0
     text = page.read_text("utf-8")
-    assert "2 of 2 comparisons passed (1 of 1 independent, 0 of 0 single stages, 1 of 1 own definitions); 1 were" in text
+    assert (
+        "2 of 2 comparisons passed (1 of 1 independent, 0 of 0 single stages, 1 of 1 own definitions); 1 were" in text
+    )
     assert text.index("## Independent comparisons") < text.index("## Own definition") < text.index("## Limitations")
     assert text.count("\n| `") == 4
     assert "| 16 kHz; defaults | largest difference over all channels and frames |" in text  # ild
