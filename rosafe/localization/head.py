@@ -93,7 +93,7 @@ class Head:
     def from_sofa(cls, path: str | os.PathLike[str], mirror: bool | None = None) -> Head:
         """Read a head from a SOFA file with the convention SimpleFreeFieldHRIR (AES69).
 
-        Ears and azimuths are checked: of a source at a side, the nearer ear is the louder one at 4 to 8 kHz. If the
+        Ears and azimuths are checked: the ear near a source at a side is the louder one at 4 to 8 kHz. If the
         labels of the file say the opposite, it is read corrected, with a warning. Another warning names the number of
         directions that could not be used.
 

@@ -198,7 +198,7 @@ class _SofaReader:
         return lowest
 
     def _cartesian(self, key: str, values: FloatArray, attributes: Any, direction: bool = False) -> FloatArray:
-        """Return positions (..., 3) in Cartesian coordinates (m); those of a `direction` have the length 1."""
+        """Return positions (..., 3) in Cartesian coordinates (m), with the length 1 if they are a `direction`."""
         kind, units = (self._text(attributes, name).strip().lower() for name in ("Type", "Units"))
         self._expect(kind in ("spherical", "cartesian", ""), f"spherical or cartesian {key}", short_repr(kind))
         default = key == "SourcePosition" and not kind and not units  # AES69: spherical by default
@@ -365,7 +365,7 @@ def near_ear_level(azimuths: FloatArray, responses: FloatArray, sample_rate: flo
 
 
 def _main_distance(distances: FloatArray, azimuths: FloatArray) -> float:
-    """Return the median of those distances (m), equal but for errors of measurement, that have most directions."""
+    """Return the median (m) of the group of similar distances that has most directions."""
     ordered = np.sort(distances)
     groups = np.split(ordered, np.flatnonzero(np.diff(ordered) > MAX_DISTANCE / 2 * ordered[:-1]) + 1)
     inside = [azimuths[(distances >= group[0]) & (distances <= group[-1])] for group in groups]

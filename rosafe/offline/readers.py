@@ -100,10 +100,10 @@ def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo, expected: tuple[
 
 
 def _check_text(name: str, text: np.ndarray) -> None:
-    """Raise ValueError for codes that are no characters: numpy would make an invalid text of them."""
+    """Raise ValueError for invalid character codes: numpy would make an invalid text of them."""
     codes = text.reshape(1).view("<u4" if text.dtype.str[0] == "<" else ">u4")
     if codes.max(initial=0) > sys.maxunicode:
-        raise ValueError(f"{name[:80]!r}: expected a text, got codes that are no characters")
+        raise ValueError(f"{name[:80]!r}: expected a text, got invalid character codes")
 
 
 def _fill(content: IO[bytes], buffer: memoryview) -> None:
