@@ -42,20 +42,23 @@ def add_settings(parser: argparse.ArgumentParser, where: str) -> None:
 
 
 def add_mirror(parser: argparse.ArgumentParser) -> None:
-    """Add --mirror and --no-mirror for the head."""
+    """Add --mirror and --no-mirror."""
     parser.add_argument(
         "--mirror",
         action=argparse.BooleanOptionalAction,
-        help="whether the labels of the SOFA file are corrected: ears exchanged if it has the right ear first, "
-        "otherwise azimuths negated (default: if the ear that faces the source is clearly the quieter one)",
+        help="whether the labels of a SOFA file exchange left and right (default: decided by the levels at the ears)",
     )
 
 
-def head_of(path: str | None, mirror: bool | None) -> Any:
-    """Return the head for `--head` with `--mirror`: a Head for a SOFA file, otherwise the name (sphere if None)."""
+def head_of(head: str, mirror: bool | None) -> Any:
+    """Return the head of --head and --mirror for `rosafe.localize`; ValueError if they do not fit together."""
+    if mirror is None:
+        return head
+    if not head.lower().endswith(".sofa"):
+        raise ValueError(f"--mirror: expected a SOFA file as the head, got {head}")
     from rosafe.localization.head import Head
 
-    return Head.from_sofa(path, mirror) if path and path.lower().endswith(".sofa") else path or "sphere"
+    return Head.from_sofa(head, mirror)
 
 
 def ear_channels(text: str) -> tuple[int, int]:

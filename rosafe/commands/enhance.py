@@ -20,8 +20,8 @@ from rosafe.output import check_target, write_files
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
-        "rosafe enhance SOUND --azimuth DEG [--head FILE] [--[no-]mirror] -o OUT.wav\n"
-        "                      [--channels L,R] [--set NAME=VALUE ...] [--force]"
+        "rosafe enhance SOUND --azimuth DEG [--head FILE] [--[no-]mirror] -o OUT.wav [--channels L,R]\n"
+        "                      [--set NAME=VALUE ...] [--force]"
     )
     parser.add_argument("inputs", nargs="*", metavar="SOUND", help="sound file or rosbag with two ears")
     parser.add_argument(
@@ -71,7 +71,11 @@ def run(options: argparse.Namespace) -> int:
     try:
         sound, rate = read_ears(inputs[0], options.channels)
         enhanced = enhance(
-            sound, rate, options.azimuth, head_of(options.head, options.mirror), parameters_of(options.settings) or None
+            sound,
+            rate,
+            options.azimuth,
+            head_of(options.head, options.mirror),
+            parameters_of(options.settings) or None,
         )
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None

@@ -22,18 +22,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
         "rosafe head learn HEAD.sofa|RECORDINGS.csv -o FILE [--rate HZ] [--[no-]mirror]\n"
-        "                  [--set NAME=VALUE ...] [--force]"
+        "                         [--set NAME=VALUE ...] [--force]"
     )
     parser.add_argument("action", type=_action, metavar="learn", help="what to do")
     parser.add_argument("inputs", nargs="*", metavar="SOURCE", help="SOFA file, or CSV file with a list of recordings")
     parser.add_argument("-o", "--to", dest="to", metavar="FILE", required=True, help="the model")
-    add_mirror(parser)
     parser.add_argument(
         "--rate",
         type=option_types.whole_number(8000, 768_000),
         metavar="HZ",
         help=f"sample rate of the sounds to localize (default: {_RATE}; that of the recordings)",
     )
+    add_mirror(parser)
     add_settings(parser, "rosafe process -h lists them")
     parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
     parser.epilog = (
@@ -66,6 +66,8 @@ def run(options: argparse.Namespace) -> int:
     progress = terminal_progress(inputs[0])
     try:
         if inputs[0].lower().endswith(".csv"):
+            if options.mirror is not None:
+                raise ValueError(f"--mirror: expected a SOFA file, got {inputs[0]}")
             model = learn_recordings(inputs[0], options.rate, parameters, progress)
         else:
             model = learn_head(

@@ -16,6 +16,7 @@ import argparse
 import functools
 import importlib
 import sys
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -37,8 +38,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "rosafe localize SOUND [--head FILE] [--[no-]mirror] [--seconds S] [--yaw FILE.csv]\n"
         "                       [-o OUT.csv|.json|.png] [--channels L,R] [--set NAME=VALUE ...] [--force]\n"
         "       rosafe localize [--head FILE] [--[no-]mirror] [--seconds S] [--world-frame NAME] [--head-frame NAME]\n"
-        "                       [--rosafe NAME] [--connect TOPIC] [--set NAME=VALUE ...] [--name NAME]\n"
-        "                       [-b] [--wait] [NAME:=VALUE ...]"
+        "                       [--rosafe NAME] [--connect TOPIC] [--set NAME=VALUE ...] [--name NAME] [-b] [--wait]\n"
+        "                       [NAME:=VALUE ...]"
     )
     parser.add_argument("inputs", nargs="*", metavar="SOUND", help="sound file or rosbag with two ears")
     parser.add_argument(
@@ -143,16 +144,21 @@ def _localize(path: str, options: argparse.Namespace) -> int:
     try:
         yaw: Any = read_yaw(options.yaw) if options.yaw else 0.0
         sound, rate = read_ears(path, options.channels)
-        result = localize(
-            sound,
-            rate,
-            head_of(options.head, options.mirror),
-            options.seconds or 0.5,
-            parameters_of(options.settings) or None,
-            head_yaw=yaw,
-        )
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            result = localize(
+                sound,
+                rate,
+                head_of(options.head or "sphere", options.mirror),
+                options.seconds or 0.5,
+                parameters_of(options.settings) or None,
+                head_yaw=yaw,
+            )
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
+    for warning in caught:
+        if issubclass(warning.category, UserWarning):
+            print(f"rosafe localize: {printable(warning.message)}", file=sys.stderr)
     if not files:
         sys.stdout.write(estimates_csv(result))
     title = printable(Path(path).name)

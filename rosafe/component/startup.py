@@ -333,19 +333,20 @@ def ensure_log_directory() -> None:
 def log_to_stderr() -> None:
     """Redirect rospy's information lines to stderr, where its warnings are: stdout is for the output of requests.
 
-    Text that they quote from clients and files is escaped. Warnings of the library become log lines.
+    Warnings of Python become warnings of the node. Text that they quote from clients and files is escaped.
     """
     import logging
 
     import rospy
     from rosgraph.roslogging import RosStreamHandler
 
+    warnings.showwarning = lambda message, *_: rospy.logwarn("%s", message)
+
     class Handler(RosStreamHandler):
         def emit(self, record: logging.LogRecord) -> None:
             text = printable(record.getMessage(), keep="\n")
             super().emit(logging.makeLogRecord({**vars(record), "msg": text, "args": ()}))
 
-    warnings.showwarning = lambda text, *_, **__: rospy.logwarn(str(text))
     rosout = logging.getLogger("rosout")
     for handler in rosout.handlers[:]:
         if isinstance(handler, RosStreamHandler):

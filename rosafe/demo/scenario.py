@@ -86,7 +86,7 @@ def run(
         directions = finder.result(float(shown.times[-1])) if finder else None
         truth: dict[str, np.ndarray] = {}
         if finder and directions and sound.truth:
-            truth = true_azimuths(sound.truth, directions["time"], finder.head.is_sphere)
+            truth = true_azimuths(sound.truth, directions["time"], finder.head.front_back_equal)
         if directions:
             _print_path(directions, truth)
         _draw(shown, sound, directions, truth, plot_file)

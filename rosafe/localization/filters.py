@@ -12,6 +12,7 @@ import numpy as np
 import scipy.fft
 
 from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.localization import angles
 
 HOP = 256  # frames between two directions of a moving source, at most; rendering fades from one to the next
 _BATCH = 64  # hops that are filtered at a time, to bound memory
@@ -27,6 +28,10 @@ class HeadFilters:
         Degrees, ascending in (-180, 180].
     responses : ndarray, (A, 2, N)
         Impulse responses of the left and the right ear at the sample rate of the sound.
+    delays : ndarray, (A, 2), optional
+        Delays in samples by which the responses are aligned; `onset_delays` by default.
+    front_only : bool
+        Whether the azimuths cover the front half only; directions behind are then replaced by their front images.
 
     Attributes
     ----------
@@ -34,11 +39,20 @@ class HeadFilters:
         Length of the transforms: a hop and a response fit in.
     """
 
-    def __init__(self, azimuths: FloatArray, responses: FloatArray) -> None:
+    def __init__(
+        self,
+        azimuths: FloatArray,
+        responses: FloatArray,
+        delays: FloatArray | None = None,
+        front_only: bool = False,
+    ) -> None:
         self.azimuths = azimuths
         self.responses = responses
         self.size = scipy.fft.next_fast_len(HOP + responses.shape[2], real=True)
-        self._delays = np.array([onset_delays(pair) for pair in responses])  # all at once needs much memory
+        self._front_only = front_only
+        if delays is None:
+            delays = np.array([onset_delays(pair) for pair in responses])  # all at once needs much memory
+        self._delays = delays
         self._phase = -2j * np.pi * np.fft.rfftfreq(self.size, 1.0)
         self._aligned = np.fft.rfft(responses, self.size) * np.exp(-self._phase * self._delays[..., np.newaxis])
 
@@ -49,6 +63,8 @@ class HeadFilters:
 
     def at(self, azimuths: FloatArray) -> np.ndarray:
         """Return the spectra (K, 2, size // 2 + 1) for `azimuths` (K,) in degrees."""
+        if self._front_only:
+            azimuths = np.clip(angles.lateral(azimuths), self.azimuths[0], self.azimuths[-1])
         index = np.searchsorted(self.azimuths, azimuths, side="right") - 1  # -1: between the last and the first
         following = (index + 1) % len(self.azimuths)
         start = self.azimuths[index]
@@ -61,6 +77,8 @@ class HeadFilters:
 
     def response(self, azimuth: float) -> FloatArray:
         """Return the impulse response (2, N) for one azimuth in degrees."""
+        if self._front_only:
+            azimuth = float(angles.lateral(azimuth))
         exact = np.flatnonzero(self.azimuths == azimuth)
         if len(exact):
             return np.asarray(self.responses[exact[0]])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import warnings
 from fractions import Fraction
 from typing import Any
 
@@ -18,7 +19,7 @@ from rosafe.dsp.numeric_limits import LIMIT, FloatArray
 from rosafe.localization import angles
 from rosafe.localization.filters import HOP, HeadFilters, SourceRenderer
 from rosafe.localization.sofa import MAX_NUMBERS, MAX_RATE, MIN_RATE, read_sofa
-from rosafe.localization.sphere import sphere_responses
+from rosafe.localization.sphere import sphere_filters
 from rosafe.terminal import printable
 
 _SYMMETRY = 1e-6  # of the energy; below, two ears count as mirrored
@@ -43,15 +44,12 @@ class Head:
     sample_rate : float
         Of the responses, Hz.
     front_only : bool
-        Whether the directions cover the front half only.
+        Whether the responses cover the front half only.
 
     Attributes
     ----------
-    is_sphere : bool
-        Whether front and back have equal interaural cues, so that azimuths are in the front half: the sphere, and a
-        head that was measured in the front half only.
     front_only : bool
-        Whether it was measured in the front half only.
+        Whether the responses cover the front half (-90 to 90 degrees) only.
 
     Examples
     --------
@@ -72,7 +70,6 @@ class Head:
     ) -> None:
         self.name = name
         self.azimuths = azimuths
-        self.is_sphere = responses is None or front_only
         self.front_only = front_only
         self._responses = responses
         self._rate = sample_rate
@@ -85,7 +82,8 @@ class Head:
     def sphere(cls) -> Head:
         """Return a rigid sphere with a radius of 8.75 cm and ears at -90 and 90 degrees.
 
-        See `rosafe.sound.head`: Woodworth's delays and the head shadow of Brown and Duda (1998).
+        The responses are those of R. O. Duda and W. L. Martens (1998), J. Acoust. Soc. Am. 104, 3048-3058, for plane
+        waves.
         """
         return cls("sphere", angles.grid(), None, _CUE_RATE)
 
@@ -93,34 +91,56 @@ class Head:
     def from_sofa(cls, path: str | os.PathLike[str], mirror: bool | None = None) -> Head:
         """Read a head from a SOFA file with the convention SimpleFreeFieldHRIR (AES69).
 
-        Ears and azimuths are checked: the ear near a source at a side is the louder one at 4 to 8 kHz. If the
-        labels of the file say the opposite, it is read corrected, with a warning. Another warning names the number of
-        directions that could not be used.
-
         Parameters
         ----------
         path : str or Path
-            The file. Measurements within 2.5 degrees of the horizontal plane of the head are used, in each direction
-            the nearest. They must surround the head, or cover its front half, with gaps of at most 30 degrees.
+            The file. Each direction is the measurement nearest to the horizontal plane, at most 3 degrees from it and
+            within 5 % of the distance that most directions have. The directions must surround the head, or cover the
+            front half (-90 to 90 degrees), with gaps of at most 30 degrees.
         mirror : bool, optional
-            Whether the labels are corrected without a check: the ears are exchanged if the file has the right ear
-            first, otherwise the azimuths are negated.
+            Whether the labels of the file are wrong: its ears are exchanged if it labels the right ear first, and its
+            azimuths are negated otherwise. By default they are wrong if sources at the sides are at least 3 dB louder
+            in the farther ear at 4 to 8 kHz.
 
         Raises
         ------
         ValueError
             The file is missing, damaged, no SOFA file or unsuitable: one line that names it.
+
+        Warns
+        -----
+        UserWarning
+            If labels are corrected, or directions are left out: one line.
         """
+        if mirror is not None and not isinstance(mirror, bool):
+            raise ValueError(f"mirror: expected True, False or None, got {short_repr(mirror)}")
         read = read_sofa(path, mirror)
+        if read.notes:
+            warnings.warn(f"{printable(os.fspath(path))}: {'; '.join(read.notes)}", UserWarning, stacklevel=2)
         return cls(os.fspath(path), read.azimuths, read.responses, read.sample_rate, read.front_only)
 
     def __repr__(self) -> str:
         return f"<Head {self.name}: {len(self.azimuths)} directions>"
 
     @property
+    def front_back_equal(self) -> bool:
+        """Whether directions behind count as equal to their front images: azimuths are then in the front half."""
+        return self._responses is None or self.front_only
+
+    def check_azimuths(self, azimuths: FloatArray) -> None:
+        """Raise ValueError if the head has no responses for one of the azimuths (degrees)."""
+        outside = np.abs(angles.wrap(azimuths)) > 90.0 + 1e-9
+        if self.front_only and np.any(outside):
+            value = float(np.ravel(angles.wrap(azimuths))[np.ravel(outside)][0])
+            raise ValueError(
+                f"azimuth: expected -90 to 90 degrees, which {printable(self.name)} covers, got {value:g}; "
+                "use a head that is measured all around"
+            )
+
+    @property
     def key(self) -> str:
         """A digest of the responses, equal for equal heads."""
-        digest = hashlib.sha256(f"{self._rate} {self.is_sphere}".encode())
+        digest = hashlib.sha256(f"{self._rate} {self._responses is None}".encode())
         if self._responses is not None:
             digest.update(self.azimuths.tobytes())
             digest.update(np.ascontiguousarray(self._responses).tobytes())
@@ -148,7 +168,7 @@ class Head:
 
     def _make_filters(self, sample_rate: float) -> HeadFilters:
         if self._responses is None:
-            return HeadFilters(self.azimuths, sphere_responses(self.azimuths, sample_rate))
+            return sphere_filters(sample_rate)
         ratio = Fraction(sample_rate / self._rate).limit_denominator(1000)
         responses = self._responses
         numbers = math.ceil(responses.size * ratio)
@@ -161,19 +181,7 @@ class Head:
             responses = scipy.signal.resample_poly(responses, ratio.numerator, ratio.denominator, axis=-1) / float(
                 ratio
             )
-        azimuths = self.azimuths
-        if self.front_only:  # the back is the mirrored front, as the sphere has it; `render` refuses it
-            azimuths = np.concatenate((azimuths, angles.wrap(180.0 - azimuths)))
-            azimuths, rows = np.unique(np.round(azimuths, 6), return_index=True)
-            responses = responses[rows % len(responses)]
-        return HeadFilters(azimuths, responses)
-
-    def _check_covered(self, azimuths: FloatArray) -> None:
-        if self.front_only and not (np.abs(angles.wrap(azimuths)) <= 90.0).all():
-            raise ValueError(
-                f"azimuth: expected -90 to 90 degrees, which {printable(self.name)} covers, got a direction behind the "
-                "head; use a head that was measured all around"
-            )
+        return HeadFilters(self.azimuths, responses, front_only=self.front_only)
 
     def render(self, signal: Any, sample_rate: float, azimuth: Any) -> FloatArray:
         """Render a signal at a direction.
@@ -196,8 +204,7 @@ class Head:
         Raises
         ------
         ValueError
-            For a signal that is not one-dimensional and finite, an azimuth of another shape, or one that the head does
-            not cover.
+            For a signal that is not one-dimensional and finite, or an azimuth of another shape.
         """
         samples = np.asarray(signal)
         if samples.ndim != 1 or samples.dtype.kind not in "iuf":
@@ -207,7 +214,7 @@ class Head:
             raise ValueError(f"signal: expected finite samples up to {LIMIT:g}, got larger ones, NaN or infinity")
         filters = self.filters(sample_rate)
         directions = _checked_azimuth(azimuth, samples.shape)
-        self._check_covered(directions)
+        self.check_azimuths(directions)
         if not len(samples):
             return np.empty((2, 0))
         if directions.ndim == 0:
@@ -254,8 +261,8 @@ class Head:
         directions = np.atleast_1d(
             self.azimuths if azimuths is None else _checked_azimuth(azimuths, np.shape(azimuths))
         )
-        self._check_covered(directions)
         filters = self.filters(rate)
+        self.check_azimuths(directions)
         at = filters.at(angles.wrap(directions))
         bins = np.fft.rfftfreq(filters.size, 1 / rate)
         distance = (bins - centers[:, np.newaxis]) / (1.019 * np.asarray(bandwidth(centers))[:, np.newaxis])

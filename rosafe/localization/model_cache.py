@@ -20,7 +20,7 @@ from rosafe.localization.training import Progress, learn_head
 from rosafe.output import OutputError
 from rosafe.trust import foreign, user_cache
 
-VERSION = 3  # of the method; another one makes models on disk obsolete
+VERSION = 4  # of the method; another one makes models on disk obsolete
 _models: weakref.WeakKeyDictionary[Head, dict[str, DirectionModel]] = weakref.WeakKeyDictionary()
 _by_key: weakref.WeakValueDictionary[str, DirectionModel] = weakref.WeakValueDictionary()  # for equal heads
 

@@ -14,8 +14,8 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles, training
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.head import checked_rate
+from rosafe.localization.horizontal_plane import MAX_GAP
 from rosafe.localization.results import read_recordings
-from rosafe.localization.sofa import MAX_GAP
 from rosafe.localization.training import Progress
 from rosafe.offline.memory import refuse_over_available
 from rosafe.offline.sounds import open_sound

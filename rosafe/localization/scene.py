@@ -107,6 +107,17 @@ class SceneDescription:
     duration: float | None = None
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Raise ValueError if a source is behind a head that covers the front half only."""
+        if not self.head.front_only:
+            return
+        for source in self.sources:
+            times = np.unique((*source.azimuth.times, *self.head_yaw.times))
+            relative = source.azimuth.at(times) - self.head_yaw.at(times)
+            self.head.check_azimuths(relative)
+            if np.ptp(relative) > 180.0:
+                raise ValueError(f"{source.name}: expected directions in front of the head, got a course behind it")
+
     def truth(self, time: float) -> Truth:
         """Return yaw and directions at a time (s)."""
         yaw = float(self.head_yaw.at(np.array([time]))[0])

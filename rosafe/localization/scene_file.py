@@ -124,15 +124,17 @@ class _SceneReader:
         return os.path.join(self._folder, os.path.expanduser(text))
 
     def _head(self, node: YamlNode, what: str) -> Head:
+        mirror = None
+        if node.pairs is not None:
+            values = {name: value for name, _, value in node.members(what, ("file", "mirror"))}
+            mirror = _flag(values["mirror"], f"{what}: mirror") if "mirror" in values else None
+            node, what = values.get("file", YamlNode(node.line)), f"{what}: file"
         if node.scalar(what) == "sphere":
             return Head.sphere()
         path = self._path(node, what)
         if not path.lower().endswith(".sofa"):
             raise SetupError(node.line, f"{what}: expected 'sphere' or a file that ends in .sofa")
-        head = Head.from_sofa(path)
-        if head.front_only:
-            raise SetupError(node.line, f"{what}: expected a head measured all around, got the front half only")
-        return head
+        return Head.from_sofa(path, mirror)
 
     def _sources(self, nodes: tuple[YamlNode, ...]) -> tuple[SourceDescription, ...]:
         sources: dict[str, SourceDescription] = {}

@@ -55,8 +55,8 @@ def learn_head(
     symmetric = head.is_symmetric()
     if symmetric:
         directions = directions[directions >= 0]
-    if head.is_sphere:
-        directions = directions[np.abs(directions) <= 90]
+    if head.front_back_equal:
+        directions = directions[directions <= 90]
     random = np.random.default_rng(1)
     noises = _noise_pool(lambda azimuth: filters.response(azimuth), sample_rate, random)
     seconds = SOUND_SECONDS / (len(directions) * len(SNR_DB))
@@ -83,7 +83,7 @@ def learn_head(
 
     grid = angles.grid()
     histograms, description = count(sounds(), sample_rate, parameters, grid, head.key)
-    if head.is_sphere:
+    if head.front_back_equal:
         behind = np.abs(grid) > 90
         source = _indices(grid, np.where(grid >= 0, 180 - grid, -180 - grid))
         histograms.itd[behind], histograms.ild[behind] = histograms.itd[source[behind]], histograms.ild[source[behind]]
@@ -92,7 +92,7 @@ def learn_head(
         poles = _indices(grid, np.array([0.0, 180.0]))
         for counts in (histograms.itd, histograms.ild):
             counts[poles] = counts[poles].sum(axis=0)
-    return DirectionModel({**description, "is_sphere": head.is_sphere}, *histograms.tables())
+    return DirectionModel({**description, "is_sphere": head.front_back_equal}, *histograms.tables())
 
 
 def count(

@@ -141,6 +141,8 @@ class Models:
         path = os.path.expanduser(settings.head)
         if path.lower().endswith(".sofa"):
             self._head = Head.from_sofa(path, settings.mirror)
+        elif settings.mirror is not None:
+            raise ValueError(f"mirror: expected a SOFA file as the head, got {settings.head!r}")
         elif settings.head != "sphere":
             self._head = DirectionModel.load(path)
 

@@ -26,7 +26,7 @@ class LocalizerSettings:
     head : str
         `sphere`, or the path of a SOFA file or of a learned model.
     mirror : bool or None
-        Whether the labels of the SOFA file are corrected; None: by a check, as in `Head.from_sofa`.
+        Of a SOFA file, as of `rosafe.Head.from_sofa`.
     seconds : float
         Length of the window of integration.
     world_frame : str
@@ -78,29 +78,18 @@ def read_settings(options: Mapping[str, Any], node: str = "~") -> LocalizerSetti
         if given is None and setting.name != "parameters":
             given = rospy.get_param(f"{node}{setting.name}", None)
         if given is not None:
-            values[setting.name] = (
-                _check(setting.name, given) if setting.name != "mirror" else _flag(setting.name, given)
-            )
+            values[setting.name] = _check(setting.name, given)
     settings = LocalizerSettings(**values)
     if settings.world_frame == settings.head_frame:
         raise ValueError(f"world_frame: expected another frame than head_frame, got {settings.world_frame!r}")
     return settings
 
 
-def _flag(name: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise ValueError(f"{name}: expected true or false, got {short_repr(value)}")
-    return value
-
-
 def _check(name: str, value: Any) -> Any:
-    if name == "parameters":
-        return value
+    if name in ("parameters", "mirror"):
+        return value if name == "parameters" else _flag(name, value)
     if name in ("seconds", "audio_delay"):
-        low, high = (0.01, MAX_SECONDS) if name == "seconds" else (-MAX_AUDIO_DELAY, MAX_AUDIO_DELAY)
-        if not is_number(value) or not low <= value <= high:
-            raise ValueError(f"{name}: expected a number from {low:g} to {high:g}, got {short_repr(value)}")
-        return float(value)
+        return _number(name, value)
     if not isinstance(value, str) or len(value) > 4096:
         raise ValueError(f"{name}: expected a text, got {short_repr(value)}")
     if name in ("world_frame", "head_frame"):
@@ -110,3 +99,16 @@ def _check(name: str, value: Any) -> Any:
     if not value and name in ("head", "head_frame", "rosafe"):
         raise ValueError(f"{name}: expected a text that is not empty")
     return value
+
+
+def _flag(name: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"{name}: expected true or false, got {short_repr(value)}")
+    return value
+
+
+def _number(name: str, value: Any) -> float:
+    low, high = (0.01, MAX_SECONDS) if name == "seconds" else (-MAX_AUDIO_DELAY, MAX_AUDIO_DELAY)
+    if not is_number(value) or not low <= value <= high:
+        raise ValueError(f"{name}: expected a number from {low:g} to {high:g}, got {short_repr(value)}")
+    return float(value)

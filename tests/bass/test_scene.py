@@ -55,9 +55,7 @@ def test_itd_is_woodworths(walk: np.ndarray) -> None:
     azimuth = np.radians(Scene(RATE).azimuth(np.arange(20) / 2 + 0.25))
     measured = np.array([itd(pieces[:, k]) for k in range(20)])
     expected = 0.0875 / 343 * (azimuth + np.sin(azimuth))  # a source on the left reaches the left ear first
-    assert (
-        np.abs(measured - expected).max() < 50e-6
-    )  # the filter of the shadow still adds a small delay at these frequencies
+    assert np.abs(measured - expected).max() < 60e-6  # the series of the sphere has more delay than its limit
     assert (np.diff(measured) < 0).all()
     assert measured[0] > 600e-6 and measured[-1] < -600e-6
 
@@ -66,8 +64,8 @@ def test_low_frequencies_have_more_itd_but_less_ild(walk: np.ndarray) -> None:
     """As for a real head (Kuhn 1977): up to 50 % more below 500 Hz."""
     low, high = band(walk, 100, 600)[:, :RATE], band(walk, 3000, 8000)[:, :RATE]
     assert 1.1 < itd(low) / itd(high) < 1.5
-    assert -6 < level_difference(low) < -1
-    assert -25 < level_difference(high) < -12
+    assert -6 < level_difference(low) < -0.5
+    assert -12 < level_difference(high) < -4  # the bright spot
 
 
 def test_ild_follows_the_side(walk: np.ndarray) -> None:
@@ -79,7 +77,9 @@ def test_ild_follows_the_side(walk: np.ndarray) -> None:
 
 def test_level_is_that_of_the_source_and_nothing_clips(walk: np.ndarray) -> None:
     assert np.abs(walk).max() < 0.9
-    assert 10 * np.log10(np.mean(walk[:, 4 * RATE : 6 * RATE] ** 2)) == pytest.approx(-30, abs=1.5)
+    assert 10 * np.log10(np.mean(walk[:, 4 * RATE : 6 * RATE] ** 2)) == pytest.approx(
+        -28, abs=0.5
+    )  # the sphere adds up to 2.5 dB
     softer = Scene(RATE, level=-50).frames(RATE) / 2.0**31
     assert np.allclose(softer, walk[:, :RATE] / 10, atol=2e-9)
 

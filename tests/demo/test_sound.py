@@ -42,7 +42,7 @@ def test_a_scene_from_a_file(tmp_path: Path) -> None:
     )
     sound = choose(f"scene:{path}")
     assert (sound.requested_rate, sound.sample_rate, sound.length, sound.title) == (0, 16000, 3.0, "two.yaml")
-    assert sound.note == "sources: a, b; head: sphere" and sound.head is not None and sound.head.is_sphere
+    assert sound.note == "sources: a, b; head: sphere" and sound.head is not None and sound.head.front_back_equal
     assert sound.truth is not None and sound.truth(1.0).azimuths == (30.0, -100.0) and sound.truth(2.5).names == ("b",)
 
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.special import eval_legendre, spherical_jn, spherical_yn
 
 import rosafe
 from rosafe.localization import angles
+from rosafe.localization.scene import SceneRenderer
+from rosafe.localization.scene_file import SceneError, read_scene
+from rosafe.localization.sphere import sphere_responses
 from tests.localization.conftest import KEMAR
 
 h5py = pytest.importorskip("h5py")
@@ -48,17 +53,40 @@ def write_sofa(path: Path, change: Callable[[dict[str, Any]], None] = lambda val
     return path
 
 
-def test_sphere_follows_woodworth_and_brown_and_duda() -> None:
+def _series(frequency: float, incidence: float) -> complex:
+    """Return the direct sum of Duda and Martens (1998), equation 4, for numpy's sign of the phase."""
+    size = 2 * np.pi * frequency * 0.0875 / 343.0
+    orders = np.arange(int(size) + 15)
+    derivative = spherical_jn(orders, size, True) + 1j * spherical_yn(orders, size, True)
+    terms = (-1j) ** (orders - 1) * (2 * orders + 1) * eval_legendre(orders, np.cos(incidence)) / derivative
+    return complex(np.conj(terms.sum()) / size**2)
+
+
+@pytest.mark.parametrize("rate", [16000, 44100])
+def test_the_sphere_is_the_series_of_duda_and_martens(rate: int) -> None:
+    """Levels within 0.1 dB and delays within 5 us of the series, and values of the paper's model at two points."""
     head = rosafe.Head.sphere()
-    azimuths = [-90.0, -45.0, 0.0, 45.0, 90.0]
-    itd = head.itd([4000.0], azimuths)[:, 0]
-    angle = np.radians(azimuths)
-    expected = -0.0875 / 343 * (angle + np.sin(angle))  # positive on the right: the left ear hears later
-    assert np.abs(itd - expected).max() < 60e-6
-    ild = head.ild([200.0, 4000.0], azimuths)
-    assert (np.diff(ild[:, 1]) < 0).all() and 10 < ild[0, 1] < 25
-    assert np.abs(ild[:, 0]).max() < 2
-    assert np.allclose(ild, -ild[::-1], atol=1e-9)
+    frequencies = np.array([100.0, 200.0, 500.0, 1000.0, 3000.0, 6000.0])
+    for azimuth in (0.0, 30.0, 37.5, 90.0, 150.0, -60.0):
+        response = head.filters(rate).response(azimuth)
+        turns = np.exp(-2j * np.pi * np.outer(np.arange(response.shape[1]) / rate, frequencies))
+        left, right = response @ turns
+        delay = 40 / rate + 0.0875 / 343.0  # until an impulse would be at the centre
+        for ear, side in ((left, 90.0), (right, -90.0)):
+            incidence = np.radians(azimuth - side)
+            expected = np.array([_series(frequency, incidence) for frequency in frequencies])
+            ratio = ear / (expected * np.exp(-2j * np.pi * frequencies * delay))
+            assert np.abs(20 * np.log10(np.abs(ratio))).max() < 0.1
+            assert np.abs(np.angle(ratio) / (2 * np.pi * frequencies)).max() < 5e-6
+        if azimuth == 90.0:
+            assert np.angle(left[1] / right[1]) / (2 * np.pi * 200) == pytest.approx(778e-6, abs=2e-6)
+        if azimuth == 30.0:
+            assert 20 * np.log10(np.abs(left[4] / right[4])) == pytest.approx(6.13, abs=0.1)
+
+
+def test_the_sphere_is_symmetric_front_to_back() -> None:
+    responses = sphere_responses(np.array([20.0, 160.0, -75.0, -105.0]), RATE)
+    assert np.array_equal(responses[0], responses[1]) and np.array_equal(responses[2], responses[3])
 
 
 def test_rendering_at_a_measured_direction_is_the_convolution(kemar: rosafe.Head) -> None:
@@ -156,7 +184,7 @@ def _set(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
         (_set("Data.SamplingRate", np.array([10.0])), "sample rate"),
         (_set("SourcePosition", lambda p: p + np.array([0, 45, 0])), "horizontal plane"),
         (_set("SourcePosition", lambda p: p * np.array([0.4, 1, 1])), "a gap of"),
-        (_set("SourcePosition", lambda p: p[:5]), "1 or 36 rows of 3 coordinates in SourcePosition"),
+        (_set("SourcePosition", lambda p: p[:5]), "36 rows in SourcePosition"),
         (_set("ReceiverPosition", np.zeros((2, 3, 1))), "one receiver on the left"),
         (_set("Data.Delay", np.array([[0.0, 1e9]])), "delays of at most"),
         (_set("SourcePosition", {}), "SourcePosition: expected an array"),
@@ -240,3 +268,159 @@ def test_angles() -> None:
     assert angles.lateral([0, 30, 90, 150, 180, -150, -90]).tolist() == [0, 30, 90, 30, 0, -30, -90]
     assert angles.unwrap(np.array([170.0, -170.0, -150.0])).tolist() == [170, 190, 210]
     assert len(angles.grid()) == 72 and angles.grid()[-1] == 180
+
+
+# --- labels, noise and rotations in SOFA files -------------------------------------------------------------------
+
+UNIS = Path(__file__).parents[3] / "shared/rooms/UniS_Anechoic_BRIR_16k.sofa"
+
+
+def sphere_sofa(change: Callable[[dict[str, Any]], None] = lambda values: None) -> Callable[[dict[str, Any]], None]:
+    """Return a change of `write_sofa` that has the responses of the sphere every 5 degrees; `change` comes after it."""
+
+    def apply(values: dict[str, Any]) -> None:
+        azimuths = np.arange(0, 360, 5.0)
+        values["Data.IR"] = sphere_responses(azimuths, RATE)
+        values["SourcePosition"] = np.stack((azimuths, np.zeros(72), np.full(72, 1.4)), 1)
+        change(values)
+
+    return apply
+
+
+def _right_first(values: dict[str, Any]) -> None:
+    values["ReceiverPosition"] = values["ReceiverPosition"][::-1]
+
+
+def _clockwise(values: dict[str, Any]) -> None:
+    values["SourcePosition"] = values["SourcePosition"] * np.array([-1, 1, 1]) + np.array([360, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("change", "done"), [(_right_first, "the ears are exchanged"), (_clockwise, "the azimuths are negated")]
+)
+def test_wrong_labels_are_corrected(tmp_path: Path, change: Callable[[dict[str, Any]], None], done: str) -> None:
+    path = write_sofa(tmp_path / "wrong.sofa", sphere_sofa(change))
+    plain = rosafe.Head.from_sofa(write_sofa(tmp_path / "plain.sofa", sphere_sofa()))
+    with pytest.warns(UserWarning, match=done) as caught:
+        head = rosafe.Head.from_sofa(path)
+    assert len(caught) == 1 and "--no-mirror" in str(caught[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        kept, mirrored = rosafe.Head.from_sofa(path, mirror=False), rosafe.Head.from_sofa(path, mirror=True)
+    assert head.key == plain.key == mirrored.key
+    assert kept.ild([4000.0], [60.0])[0, 0] > 5 > -5 > head.ild([4000.0], [60.0])[0, 0]
+
+
+def test_a_real_file_of_the_front_half_with_clockwise_azimuths() -> None:
+    if not UNIS.exists():
+        pytest.skip(f"{UNIS.name} is not available")
+    with pytest.warns(UserWarning, match="the azimuths are negated"):
+        head = rosafe.Head.from_sofa(UNIS)
+    assert head.front_only and head.front_back_equal and len(head.azimuths) == 37
+    left, right = head.render(np.random.default_rng(1).standard_normal(4000), 16000, 60).std(axis=1)
+    assert left > 2 * right
+    with pytest.raises(ValueError, match=r"azimuth: expected -90 to 90 degrees, .*got 120"):
+        head.render(np.ones(100), 16000, 120)
+
+
+@pytest.mark.parametrize(("azimuth", "fits"), [("[[0, 80], [5, 20]]", True), ("120", False)])
+def test_scenes_with_a_front_half(tmp_path: Path, azimuth: str, fits: bool) -> None:
+    """Also with labels that the scene corrects, and with noise from the front half."""
+
+    def front(values: dict[str, Any]) -> None:
+        _right_first(values)
+        keep = np.cos(np.radians(values["SourcePosition"][:, 0])) > -1e-9
+        values["Data.IR"], values["SourcePosition"] = values["Data.IR"][keep], values["SourcePosition"][keep]
+
+    write_sofa(tmp_path / "front.sofa", sphere_sofa(front))
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(
+        "head: {file: front.sofa, mirror: true}\nnoise: {snr_db: 20}\n"
+        f"sources:\n  - {{name: a, signal: noise, azimuth: {azimuth}}}\n"
+    )
+    if fits:
+        samples = SceneRenderer(read_scene(scene)).frames(44100)
+        assert np.std(samples[0]) > 1.3 * np.std(samples[1])
+    else:
+        with pytest.raises(SceneError, match=r"azimuth: expected -90 to 90 degrees, which .*got 120"):
+            read_scene(scene)
+
+
+def test_noise_of_positions_loses_no_direction(tmp_path: Path) -> None:
+    random = np.random.default_rng(1)
+
+    def noisy(values: dict[str, Any]) -> None:
+        values["SourcePosition"] += random.uniform(-1, 1, (72, 3)) * np.array([0.1, 2.0, 0.01])
+
+    assert len(rosafe.Head.from_sofa(write_sofa(tmp_path / "noise.sofa", sphere_sofa(noisy))).azimuths) == 72
+
+
+def test_of_several_rings_and_distances_one_is_used(tmp_path: Path) -> None:
+    def rings(values: dict[str, Any]) -> None:
+        position, responses = values["SourcePosition"], values["Data.IR"]
+        values["SourcePosition"] = np.concatenate(
+            [
+                position * np.array([1, 1, scale]) + np.array([0, elevation, 0])
+                for elevation in (-1, 0, 1)
+                for scale in (0.5, 1, 2)
+            ]
+        )
+        values["Data.IR"] = np.concatenate([responses * factor for factor in (1, 2, 3, 4, 5, 6, 7, 8, 9)])
+
+    head = rosafe.Head.from_sofa(write_sofa(tmp_path / "rings.sofa", sphere_sofa(rings)))
+    plain = rosafe.Head.from_sofa(write_sofa(tmp_path / "plain.sofa", sphere_sofa()))
+    assert np.allclose(head.filters(RATE).responses, 6 * plain.filters(RATE).responses)
+
+
+def test_rings_far_from_the_horizontal_plane_are_refused(tmp_path: Path) -> None:
+    path = write_sofa(tmp_path / "high.sofa", sphere_sofa(_set("SourcePosition", lambda p: p + np.array([0, 5, 0]))))
+    with pytest.raises(ValueError, match="within 3 degrees of the horizontal plane, got 5 degrees as the nearest"):
+        rosafe.Head.from_sofa(path)
+
+
+def test_directions_that_are_left_out_are_counted(tmp_path: Path) -> None:
+    def far(values: dict[str, Any]) -> None:
+        values["SourcePosition"][[3, 20, 40], 2] = 3.0
+
+    with pytest.warns(UserWarning, match="3 directions are left out"):
+        assert len(rosafe.Head.from_sofa(write_sofa(tmp_path / "far.sofa", sphere_sofa(far))).azimuths) == 69
+
+
+def test_views_of_each_measurement_are_used(tmp_path: Path) -> None:
+    """The source is fixed and the head turns, pitched by 20 degrees as the plane of the sources."""
+    plain = rosafe.Head.from_sofa(write_sofa(tmp_path / "plain.sofa", sphere_sofa()))
+
+    def turned(values: dict[str, Any]) -> None:
+        angle = -np.radians(values["SourcePosition"][:, 0])
+        values["SourcePosition"] = np.array([[0.0, 0.0, 1.4]])
+        values["ListenerView"] = np.stack((np.cos(angle), np.sin(angle), 0 * angle), 1)
+        values["ListenerUp"] = np.array([[0.0, 0.0, 1.0]])
+
+    assert rosafe.Head.from_sofa(write_sofa(tmp_path / "view.sofa", sphere_sofa(turned))).key == plain.key
+
+    def pitched(values: dict[str, Any]) -> None:
+        angle, pitch = np.radians(values["SourcePosition"][:, 0]), np.radians(20.0)
+        ahead, up = np.array([np.cos(pitch), 0, np.sin(pitch)]), np.array([-np.sin(pitch), 0, np.cos(pitch)])
+        values["SourcePosition"] = 1.4 * (np.outer(np.cos(angle), ahead) + np.outer(np.sin(angle), [0, 1, 0]))
+        values["position_type"], values["position_units"] = "", "Metre"
+        values["ListenerView"], values["ListenerUp"] = ahead[np.newaxis], up[np.newaxis]
+
+    assert rosafe.Head.from_sofa(write_sofa(tmp_path / "pitch.sofa", sphere_sofa(pitched))).key == plain.key
+
+
+def test_rates_that_differ_are_refused(tmp_path: Path) -> None:
+    rates = np.where(np.arange(72) == 5, 48000.0, 44100.0)
+    path = write_sofa(tmp_path / "rates.sofa", sphere_sofa(_set("Data.SamplingRate", rates)))
+    with pytest.raises(ValueError, match=r"one Data\.SamplingRate for all directions, got 44100 to 48000 Hz"):
+        rosafe.Head.from_sofa(path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "units"),
+    [("", "degree, degree, metre"), (h5py.Empty("S1"), "Degrees"), ("spherical", h5py.Empty("S1")), ("", "")],
+)
+def test_missing_types_follow_from_units(tmp_path: Path, kind: Any, units: Any) -> None:
+    def change(values: dict[str, Any]) -> None:
+        values["position_type"], values["position_units"] = kind, units
+
+    assert len(rosafe.Head.from_sofa(write_sofa(tmp_path / "units.sofa", sphere_sofa(change))).azimuths) == 72

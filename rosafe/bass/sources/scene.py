@@ -1,6 +1,6 @@
 """The source `scene:`: a built-in binaural scene, a talker that moves from far left to far right and back.
 
-The head is the sphere of rosafe/sound/head.py.
+The head is the rigid sphere of rosafe/localization/sphere.py.
 """
 
 from __future__ import annotations
@@ -12,16 +12,15 @@ import numpy as np
 from scipy import signal
 
 from rosafe.bass.sources.base import PacedSource, device_error, hwparams_error, parse_options
-from rosafe.localization.scene import Truth
+from rosafe.localization.filters import HOP, SourceRenderer
+from rosafe.localization.scene import BLOCK, Truth
+from rosafe.localization.sphere import sphere_filters
 from rosafe.option_types import number, seconds, whole_number
 from rosafe.sound.audiofile import to_int32
-from rosafe.sound.head import HEAD_TIME, ear_delay, shadow_gain
 
 WALK_SECONDS = 10.0
 LEVEL_DB = -30.0
 MIN_RATE = 1000  # Hz; almost no sound would remain below
-_BLOCK = 4096  # frames computed at once, for any chunk length, so that the samples do not depend on it
-_REACH = 3  # frames on each side that the interpolation uses
 _PITCH = (125.0, 25.0, 0.37)  # Hz: mean, excursion and speed of the talker's gliding voice
 _SYLLABLE = 0.25  # s
 
@@ -47,11 +46,7 @@ class Scene:
         self._carrier = _Carrier(sample_rate, seed)
         first_second = _Carrier(sample_rate, seed).block(np.arange(sample_rate) / sample_rate)
         self._gain = 10 ** (level / 20) / np.sqrt(np.mean(first_second**2))
-        # The shadow is alpha + (1 - alpha) / (1 + s / (2 omega0)): its pole is fixed while the source moves.
-        self._pole = signal.bilinear([1.0], [HEAD_TIME / 2, 1.0], sample_rate)
-        self._pole_state = np.zeros(1)
-        self._history = _REACH + int(np.ceil(HEAD_TIME * (1 + np.pi / 2) * sample_rate)) + _REACH
-        self._ears = np.zeros((2, self._history + _BLOCK))
+        self._renderer = SourceRenderer(sphere_filters(sample_rate))
         self._frame = 0  # number of the first frame of the next block
         self._block = np.zeros((2, 0), np.int32)
 
@@ -73,20 +68,10 @@ class Scene:
         return np.concatenate(parts, axis=1)
 
     def _next_block(self) -> np.ndarray:
-        times = (self._frame + np.arange(_BLOCK)) / self.sample_rate
-        self._frame += _BLOCK
-        azimuth = np.radians(self.azimuth(times))
-        source = self._gain * self._carrier.block(times)
-        lowpassed, self._pole_state = signal.lfilter(*self._pole, source, zi=self._pole_state)
-        out = np.empty((2, _BLOCK))
-        for ear, incidence in enumerate((np.pi / 2 - azimuth, np.pi / 2 + azimuth)):
-            history = self._ears[ear]
-            history[: self._history] = history[_BLOCK:]
-            history[self._history :] = lowpassed + shadow_gain(incidence) * (source - lowpassed)
-            # An ear is at most one head radius closer than the centre; with HEAD_TIME no sample is in the future.
-            delay = (ear_delay(incidence) + HEAD_TIME) * self.sample_rate + _REACH
-            out[ear] = _interpolate(history, self._history + np.arange(_BLOCK) - delay)
-        return to_int32(out)
+        times = (self._frame + np.arange(BLOCK + 1)) / self.sample_rate
+        self._frame += BLOCK
+        source = self._gain * self._carrier.block(times[:-1])
+        return to_int32(self._renderer.process(source, self.azimuth(times[::HOP])))
 
 
 class SceneSource(PacedSource):
@@ -159,20 +144,3 @@ class _Carrier:
         count = self._harmonics
         kernel = np.where(np.abs(low) < 1e-9, 2.0 * count + 1.0, np.sin((2 * count + 1) * half) / safe)
         return (kernel - 1.0) / np.sqrt(2.0 * count)
-
-
-def _interpolate(samples: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Return `samples` at fractional `positions`, by Lagrange interpolation through the six nearest samples."""
-    base = np.floor(positions).astype(np.intp)
-    fraction = positions - base
-    offsets = [fraction - k for k in range(-2, 4)]  # distances from the six points
-    before = [np.ones_like(fraction)]
-    for offset in offsets[:-1]:
-        before.append(before[-1] * offset)
-    after = np.ones_like(fraction)
-    result = np.zeros_like(fraction)
-    # Denominators of the basis polynomials: products of the distances between the points.
-    for k, denominator in zip(range(5, -1, -1), (120.0, -24.0, 12.0, -12.0, 24.0, -120.0), strict=True):
-        result += samples[base + (k - 2)] * (before[k] * after) / denominator
-        after = after * offsets[k]
-    return result
