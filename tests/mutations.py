@@ -671,8 +671,8 @@ MUTATIONS = (
     _representations(
         "pitch-plateau",
         "pitch.py",
-        "return ((begin + 1 + end) // 2)[..., 0]",
-        "return (begin + 1)[..., 0]",
+        "return (begin + 1 + end) // 2, np.maximum(height, 0.0)",
+        "return begin + 1, np.maximum(height, 0.0)",
         "tests/representations/test_pitch.py",
     ),
     _representations(
