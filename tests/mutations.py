@@ -901,8 +901,8 @@ MUTATIONS = (
     _validation(
         "validation-self-test-without-disturbance",
         "report.py",
-        "comparison.disturbance.change(compute) if disturbed else compute",
-        "compute",
+        "if disturbed and comparison.disturbance:",
+        "if False:",
         "tests/validation/test_validate.py",
     ),
     # --- localizer node
