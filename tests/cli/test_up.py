@@ -204,7 +204,7 @@ def test_roslaunch_starts_all_processes(alone: Graph, live: str) -> None:
 def test_roslaunch_loads_the_setup(alone: Graph) -> None:
     arguments = ("rosAFE", "rosafe.launch", "setup:=/tmp/tree.yaml", "keep:=/tmp/kept.yaml", "port:=9")
     line = alone.run("roslaunch", "--args", "/rosafe_setup", *arguments).stdout
-    assert "setup load --wait 60 --keep /tmp/kept.yaml /tmp/tree.yaml __name:=rosafe_setup" in line
+    assert "setup load --wait 60 --keep /tmp/kept.yaml -- /tmp/tree.yaml __name:=rosafe_setup" in line
     assert str(SCRIPTS) in str(Path(line.split()[0]).resolve())
     assert alone.run("rosafe", "--version", "__name:=x", "__log:=/tmp/y").stdout.startswith("rosafe ")
 

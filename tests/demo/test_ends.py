@@ -87,7 +87,8 @@ def checkout_with_install(tmp_path: Path, install: str, name: str = "demo") -> P
     """Create a checkout with another scripts/install and return its script `name`."""
     (tmp_path / "scripts").mkdir(parents=True)
     (tmp_path / "rosafe").symlink_to(ROOT / "rosafe")
-    shutil.copy(ROOT / "scripts" / name, tmp_path / "scripts")
+    for file in (name, "checkout.sh"):
+        shutil.copy(ROOT / "scripts" / file, tmp_path / "scripts")
     script = tmp_path / "scripts" / "install"
     script.write_text(f"#!/bin/bash\n{install}\n")
     script.chmod(0o755)

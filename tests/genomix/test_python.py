@@ -235,6 +235,7 @@ def test_an_activity_is_waited_for(g: genomix.Client, tmp_path: Path) -> None:
     assert bass.Audio()["Audio"]["lastFrameIndex"] == 2400
     ended: list[genomix.Request] = []
     request = bass.Acquire("scene:", callback=ended.append)
+    harness.wait_for(lambda: bass.getAcquisition()["running"])  # an activity that is aborted before it runs has failed
     assert request.wait(0.05) is genomix.Status.sent and not ended
     request.abort()
     harness.wait_for(lambda: ended == [request])

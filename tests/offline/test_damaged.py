@@ -222,7 +222,7 @@ def test_codes_that_are_no_characters(tmp_path: Path, good: Path) -> None:
             for one in old.namelist():
                 code = struct.pack("<I", 0x110000) * count
                 new.writestr(one, _npy(header, code) if one == "parameters.npy" else old.read(one))
-        refused(tmp_path / "a.npz", "expected a text, got codes" if count else "")
+        refused(tmp_path / "a.npz", "expected a text, got invalid character codes" if count else "")
 
 
 # --- .mat of version 5 --------------------------------------------------------------------------------------------

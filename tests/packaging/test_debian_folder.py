@@ -83,7 +83,8 @@ def test_exported_permissions_do_not_depend_on_those_of_the_checkout(tmp_path: P
     """As root, tar keeps those that git stores in an archive; for other users it applies the umask."""
     checkout, exported = tmp_path / "a checkout", tmp_path / "exported"
     (checkout / "scripts").mkdir(parents=True)
-    shutil.copy(ROOT / "scripts" / "export-sources", checkout / "scripts")
+    for name in ("export-sources", "checkout.sh"):
+        shutil.copy(ROOT / "scripts" / name, checkout / "scripts")
     (checkout / "CHANGELOG.md").write_text("0.3.0")
     if git:
         commit = ["-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "x"]
@@ -94,7 +95,7 @@ def test_exported_permissions_do_not_depend_on_those_of_the_checkout(tmp_path: P
     done = run(checkout / "scripts" / "export-sources", exported, env=environment())
     assert done.returncode == 0, done.stderr
     modes = {path.name: path.stat().st_mode & 0o777 for path in exported.rglob("*") if ".git" not in path.parts}
-    assert modes == {"CHANGELOG.md": 0o644, "scripts": 0o755, "export-sources": 0o755}
+    assert modes == {"CHANGELOG.md": 0o644, "scripts": 0o755, "export-sources": 0o755, "checkout.sh": 0o644}
 
 
 @pytest.mark.parametrize("arguments", [["-x"], ["--folder"], ["a", "b"]])
