@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from rosafe import option_types
 from rosafe.commands._component import format_error, open_graph
+from rosafe.commands._parameters import add_mirror
 from rosafe.interface import ComponentError
 from rosafe.setups import AcquireSettings, Setup
 
@@ -29,8 +30,8 @@ POLL_SECONDS = 1.0  # between two queries of the state of all nodes
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
-        "rosafe up [FILE.yaml] [--device DEVICE] [--localize] [--head FILE] [--live] [--keep FILE] [--port PORT]\n"
-        "                 [--live-port PORT] [--no-browser]"
+        "rosafe up [FILE.yaml] [--device DEVICE] [--localize] [--head FILE] [--[no-]mirror] [--live] [--keep FILE]\n"
+        "                 [--port PORT] [--live-port PORT] [--no-browser]"
     )
     parser.add_argument("file", metavar="FILE.yaml", nargs="?", help="the setup to load (default: none)")
     parser.add_argument("--device", metavar="DEVICE", help="capture from DEVICE, instead of the sound of FILE.yaml")
@@ -42,6 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="head for --localize: SOFA file or model (default: that of FILE.yaml, otherwise a sphere)",
     )
+    add_mirror(parser)
     parser.add_argument("--live", action="store_true", help="also serve the live page, as `rosafe live` does")
     parser.add_argument(
         "--keep",
@@ -95,10 +97,15 @@ def run(options: argparse.Namespace) -> int:
 def _localizer_settings(options: argparse.Namespace, setup: Setup | None) -> dict[str, Any] | None:
     """Return the settings of the localizer, or None if none is to be started."""
     of_setup = setup.localizer if setup is not None else None
-    if of_setup is None and not options.localize and not options.head:
+    if of_setup is None and not options.localize and not options.head and options.mirror is None:
         return None
-    head = {"head": os.path.abspath(os.path.expanduser(options.head))} if options.head else {}
-    return {**(of_setup or {}), **head}
+    settings = dict(of_setup or {})
+    if options.head:
+        settings["head"] = os.path.abspath(os.path.expanduser(options.head))
+        settings.pop("mirror", None)  # of another head
+    if options.mirror is not None:
+        settings["mirror"] = options.mirror
+    return settings
 
 
 class _Session:

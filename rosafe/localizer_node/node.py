@@ -142,7 +142,7 @@ class Models:
         if path.lower().endswith(".sofa"):
             self._head = Head.from_sofa(path, settings.mirror)
         elif settings.mirror is not None:
-            raise ValueError(f"mirror: expected a SOFA file as the head, got {settings.head!r}")
+            raise ValueError(f"mirror: expected a SOFA file as the head, got {settings.head!r}; unset mirror")
         elif settings.head != "sphere":
             self._head = DirectionModel.load(path)
 

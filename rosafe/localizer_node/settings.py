@@ -26,7 +26,7 @@ class LocalizerSettings:
     head : str
         `sphere`, or the path of a SOFA file or of a learned model.
     mirror : bool or None
-        Of a SOFA file, as of `rosafe.Head.from_sofa`.
+        Of a SOFA file, as of `rosafe.Head.from_sofa`. An empty text is None.
     seconds : float
         Length of the window of integration.
     world_frame : str
@@ -77,7 +77,7 @@ def read_settings(options: Mapping[str, Any], node: str = "~") -> LocalizerSetti
         given = options.get(setting.name)
         if given is None and setting.name != "parameters":
             given = rospy.get_param(f"{node}{setting.name}", None)
-        if given is not None:
+        if given is not None and (setting.name, given) != ("mirror", ""):  # empty: as if it were missing, for launch files
             values[setting.name] = _check(setting.name, given)
     settings = LocalizerSettings(**values)
     if settings.world_frame == settings.head_frame:

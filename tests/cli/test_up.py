@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from rosafe.commands import up
+from rosafe.setups import Setup
 from rosafe.transport.master import MasterError, check_master
 from tests import models
 from tests.harness import ROOT, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
@@ -129,12 +130,18 @@ def test_the_localizer_of_a_setup(alone: Graph, tmp_path: Path, tmp_path_factory
         ([], None),
         (["--localize"], {}),
         (["--head", "robot.head"], {"head": os.path.abspath("robot.head")}),
+        (["--head", "a.sofa", "--no-mirror"], {"head": os.path.abspath("a.sofa"), "mirror": False}),
+        (["--mirror"], {"mirror": True}),
     ],
 )
 def test_the_localizer_without_a_setup(arguments: list[str], settings: dict[str, Any] | None) -> None:
     parser = argparse.ArgumentParser()
     up.configure(parser)
-    assert up._localizer_settings(parser.parse_args(arguments), None) == settings
+    options = parser.parse_args(arguments)
+    assert up._localizer_settings(options, None) == settings
+    of_setup = {"head": "b.sofa", "mirror": True, "seconds": 0.25}
+    kept = {"seconds": 0.25} if options.head else of_setup  # the mirror of a setup is that of its head
+    assert up._localizer_settings(options, Setup(localizer=of_setup)) == {**kept, **(settings or {})}
 
 
 @pytest.mark.exploration
@@ -187,9 +194,12 @@ def test_roslaunch_starts_the_localizer(alone: Graph) -> None:
     parameters = yaml.safe_load(alone.run("roslaunch", "--dump-params", *arguments).stdout)
     assert {name: value for name, value in parameters.items() if name.startswith("/localizer/")} == {
         "/localizer/head": "/tmp/robot.head",
+        "/localizer/mirror": "",
         "/localizer/seconds": 1.0,
         "/localizer/world_frame": "",
     }
+    mirrored = alone.run("roslaunch", "--dump-params", *arguments, "mirror:=false").stdout
+    assert yaml.safe_load(mirrored)["/localizer/mirror"] is False
 
 
 @pytest.mark.parametrize("live", ["true", "false"])

@@ -357,5 +357,6 @@ def test_the_setting_of_the_node() -> None:
     given = {"head": "a.sofa", "mirror": False, "seconds": 0.5, "world_frame": "", "head_frame": "head"}
     given |= {"rosafe": "rosAFE", "connect": "", "audio_delay": 0.0, "noise": "none"}
     assert node_settings.read_settings(given).mirror is False
+    assert node_settings.read_settings({**given, "mirror": ""}).mirror is None  # of the launch file
     with pytest.raises(ValueError, match="mirror: expected true or false, got 'no'"):
         node_settings.read_settings({**given, "mirror": "no"})

@@ -62,6 +62,7 @@ def test_the_settings_of_the_localizer_become_its_parameters(graph: Graph, tmp_p
     with graph.node("rosAFE-ros"):
         for settings, expected in (
             ("{head: robot.head, audio_delay: 0.02}", {"head": str(tmp_path / "robot.head"), "audio_delay": 0.02}),
+            ("{head: a.sofa, mirror: false}", {"head": str(tmp_path / "a.sofa"), "mirror": False}),
             ("{head: sphere}", {"head": "sphere"}),
         ):
             file.write_text(f"localizer: {settings}\n")
