@@ -64,13 +64,13 @@ def sphere_responses(azimuths: FloatArray, sample_rate: float) -> FloatArray:
     length = 2 * _RINGING + int(np.ceil(_DECAY_SECONDS * sample_rate))
     size = scipy.fft.next_fast_len(4 * length, real=True)  # nothing is wrapped around
     frequencies = np.fft.rfftfreq(size, 1 / sample_rate)
-    lateral, rows = np.unique(np.round(angles.lateral(azimuths), 9), return_inverse=True)
-    cosines = np.sin(np.radians(np.concatenate((lateral, -lateral))))
+    lateral = np.round(angles.lateral(azimuths), 9)
+    lateral, rows = np.unique((lateral, -lateral), return_inverse=True)  # of the left and the right ear
     delay = HEAD_TIME + _RINGING / sample_rate
     edge = np.clip((frequencies / sample_rate - _BAND_EDGE) / (0.5 - _BAND_EDGE), 0.0, 1.0)
     band = (0.5 + 0.5 * np.cos(np.pi * edge)) * np.exp(-2j * np.pi * frequencies * delay)
-    responses = np.fft.irfft(sphere_spectra(frequencies, cosines) * band, size)[:, :length]
-    return np.asarray(responses.reshape(2, len(lateral), length)[:, rows].swapaxes(0, 1))
+    spectra = sphere_spectra(frequencies, np.sin(np.radians(lateral))) * band
+    return np.fft.irfft(spectra, size)[rows.reshape(2, -1).T, :length]
 
 
 def sphere_filters(sample_rate: float) -> HeadFilters:

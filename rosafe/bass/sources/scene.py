@@ -111,7 +111,7 @@ _OPTIONS = {
 class _Carrier:
     """The signal of the source, (block,) of float64: voiced syllables and bursts of noise.
 
-    Its bandwidth is a fifth of the sample rate, up to which the interpolation is exact, and at most 8 kHz.
+    Its bandwidth is a fifth of the sample rate, and at most 8 kHz.
     """
 
     def __init__(self, sample_rate: int, seed: int) -> None:
