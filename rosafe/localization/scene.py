@@ -115,8 +115,10 @@ class SceneDescription:
             times = np.unique((*source.azimuth.times, *self.head_yaw.times))
             relative = source.azimuth.at(times) - self.head_yaw.at(times)
             self.head.check_azimuths(relative)
-            if np.ptp(relative) > 180.0:
-                raise ValueError(f"{source.name}: expected directions in front of the head, got a course behind it")
+            if np.ptp(np.floor((relative + 91.0) / 360.0)):  # 0 from -90 to 90, 1 from 270 to 450
+                raise ValueError(
+                    f"{source.name}: expected directions in front of the head, got a course behind it; add points between"
+                )
 
     def truth(self, time: float) -> Truth:
         """Return yaw and directions at a time (s)."""

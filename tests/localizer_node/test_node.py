@@ -19,6 +19,7 @@ from rosafe.offline.stream import Stream
 from tests import models
 from tests.harness import Graph, Process, wait_for
 from tests.localization.conftest import KEMAR, RATE, modulated
+from tests.localization.test_sofa import Laboratory
 from tests.localizer_node.session import (
     Localizer,
     acquire,
@@ -68,6 +69,19 @@ def test_topics(graph: Graph, talking: Localizer) -> None:
     assert abs(best - 40) <= 10 or abs(best - 140) <= 10  # the sphere is symmetric
     steps = np.diff([message.header.stamp.to_sec() for message in sources])
     assert (steps >= 0).all() and 0.08 < np.median(steps) < 0.15, "10 Hz"
+
+
+def test_a_head_with_wrong_labels(graph: Graph, tmp_path: Path) -> None:
+    """One warning in the log, and none with ~mirror."""
+    laboratory = Laboratory()
+    laboratory.variables["ReceiverPosition"] = laboratory.variables["ReceiverPosition"][::-1]
+    path = str(laboratory.write(tmp_path / "mirrored.sofa"))
+    for mirror, count in ((None, 1), (True, 0), (False, 0)):
+        if mirror is not None:
+            graph.run("rosparam", "set", "/labels/mirror", str(mirror).lower())
+        with running_localizer(graph, "--head", path, name="labels") as labels:
+            assert labels.process.err.count("the ears are exchanged") == count, labels.process.err
+    graph.run("rosparam", "delete", "/labels")
 
 
 def test_tools_understand_the_messages(graph: Graph, talking: Localizer, tmp_path: Path) -> None:
