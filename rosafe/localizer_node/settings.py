@@ -77,7 +77,9 @@ def read_settings(options: Mapping[str, Any], node: str = "~") -> LocalizerSetti
         given = options.get(setting.name)
         if given is None and setting.name != "parameters":
             given = rospy.get_param(f"{node}{setting.name}", None)
-        if given is not None and (setting.name, given) != ("mirror", ""):  # empty: as if it were missing, for launch files
+        if setting.name == "mirror" and given == "":  # of the launch file: as if it were missing
+            continue
+        if given is not None:
             values[setting.name] = _check(setting.name, given)
     settings = LocalizerSettings(**values)
     if settings.world_frame == settings.head_frame:
