@@ -167,7 +167,7 @@ WRONG = {
     "connections:\n  audio: bass/Audio": (2, "expected one of Audio"),
     "connections:\n  Audio: bass Audio": (2, "expected the name of a topic"),
     "sounds: {}": (1, "expected one of sound, connections, processors, preset"),
-    "preset: music": (1, "preset: expected one of speech, got 'music'"),
+    "preset: music": (1, "preset: expected one of speech, onsets, got 'music'"),
     "processors:\n\t- a": (2, "not YAML"),
     "a: b: c": (1, "not YAML"),
     "a\n---\nb": (3, "a second document"),
