@@ -117,7 +117,7 @@ class SceneDescription:
             self.head.check_azimuths(relative)
             if np.ptp(np.floor((relative + 91.0) / 360.0)):  # 0 from -90 to 90, 1 from 270 to 450
                 raise ValueError(
-                    f"{source.name}: expected directions in front of the head, got a course behind it; add points between"
+                    f"{source.name}: expected directions in front of the head, got a course behind it; add points"
                 )
 
     def truth(self, time: float) -> Truth:

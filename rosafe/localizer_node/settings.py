@@ -77,7 +77,7 @@ def read_settings(options: Mapping[str, Any], node: str = "~") -> LocalizerSetti
         given = options.get(setting.name)
         if given is None and setting.name != "parameters":
             given = rospy.get_param(f"{node}{setting.name}", None)
-        if setting.name == "mirror" and given == "":  # of the launch file: as if it were missing
+        if setting.name == "mirror" and given == "":  # the default of the launch file
             continue
         if given is not None:
             values[setting.name] = _check(setting.name, given)
