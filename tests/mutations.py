@@ -162,8 +162,8 @@ MUTATIONS = (
     _commands(
         "up-localize-ignored",
         "up.py",
-        "if of_setup is None and not options.localize and not options.head:",
-        "if of_setup is None and not options.head:",
+        "if of_setup is None and not options.localize and not options.head and options.mirror is None:",
+        "if of_setup is None and not options.head and options.mirror is None:",
         "tests/cli/test_up.py -k without_a_setup",
     ),
     # --- component
