@@ -174,12 +174,11 @@ class AudioFile:
         if header.patch and not header.frames:
             self._presented = header.offset, header.patch, 1
         file_format = self._open()
-        if file_format.format not in _FORMATS:
-            raise ValueError(f"expected one of {', '.join(_FORMATS)}, got {file_format.format}; {CONVERT}")
         self.sample_rate, self.channels = int(file_format.samplerate), int(file_format.channels)
         if not 1 <= self.sample_rate <= MAX_RATE:
             raise ValueError(f"expected a sample rate of 1 to {MAX_RATE} Hz, got {self.sample_rate}")
-        self._exact = file_format.format != "FLAC" and file_format.subtype in _UNCODED
+        verified = file_format.format in _FORMATS
+        self._exact = verified and file_format.format != "FLAC" and file_format.subtype in _UNCODED
         self._float = file_format.subtype.startswith(_FLOAT_SUBTYPES)
         self.floats = self._float and not clip
         if self._exact:  # libsndfile can take bytes behind the sound as sound
@@ -187,6 +186,8 @@ class AudioFile:
             self.frames = min(int(file_format.frames), stated)
         else:
             self.frames = self._count(header, size)
+        if not verified and not self.remark:
+            self.remark = f"{self.path}: the length of {file_format.format} is not verified; the file may be truncated"
         if not self.frames:
             raise ValueError("expected samples, got none")
         if self._exact:
@@ -226,16 +227,18 @@ class AudioFile:
         stated, mpeg = int(file.frames), file.subtype.startswith("MPEG")
         if header.frames:
             return self._count_flac(header, stated, size)
+        if file.format == "MP3" and not header.exact:
+            return self._count_mp3(size)
         count = self._skip(stated)
-        if count == stated and file.format == "MP3" and not header.exact:
-            return self._count_longer(size)
         if file.format == "OGG":
             if count < header.least * self.sample_rate - 1:
                 raise ValueError(f"expected {header.least:.3f} s of sound, got fewer; the file is damaged")
         elif not mpeg or header.exact:
             self._check_count(count, stated - _MPEG_FRAME * mpeg)
-        if mpeg or file.format == "FLAC":
+        if mpeg or file.format == "FLAC" or file.format not in _FORMATS:
             self._note_rest(size)
+        if count < stated and header.exact and not self.remark:
+            self.remark = f"{self.path}: expected {stated} frames, got {count}; the last frame of MPEG may be missing"
         return count
 
     def _check_count(self, count: int, stated: int) -> None:
@@ -255,8 +258,8 @@ class AudioFile:
         self._note_rest(size)
         return count
 
-    def _count_longer(self, size: int) -> int:
-        """Return the number of frames of an MP3 that is longer than libsndfile estimates."""
+    def _count_mp3(self, size: int) -> int:
+        """Return the number of frames of an MP3 that does not state it. It can differ from libsndfile's estimate."""
         self._presented = 0, b"", _LONGER
         self._open()
         count = 0

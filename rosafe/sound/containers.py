@@ -324,7 +324,9 @@ def _ogg(file: BufferedReader, size: int) -> Header:
         raise ValueError(f"expected one stream of sound, got several; {CONVERT}")
     if missing:
         raise ValueError("expected all pages of Ogg, got gaps between them; the file is damaged")
-    remark = "" if ended else "the last page of Ogg is not marked as the end; the file may be truncated"
+    remark = "the last page of Ogg is not marked as the end; the file may be truncated"
+    if ended:
+        remark = _tail(file, page.end, size)
     return Header(remark, least=(times[-1] - times[0]) / rate if rate and times else 0.0)
 
 

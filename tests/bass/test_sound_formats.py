@@ -284,9 +284,24 @@ def test_other_formats_are_named(tmp_path: Path, begin: bytes, kind: str) -> Non
     assert f"got {kind}" in text and "`ffmpeg -i IN OUT.wav`" in text
 
 
-def test_formats_without_a_check_of_their_length_are_refused(tmp_path: Path) -> None:
-    write(tmp_path / "a.voc", "VOC", "PCM_16")
-    assert "got VOC; convert it: `ffmpeg" in refusal(tmp_path / "a.voc")
+@pytest.mark.parametrize("form", ["VOC", "AVR", "PAF", "IRCAM", "MAT5", "PVF", "HTK"])
+def test_formats_without_a_check_of_their_length(tmp_path: Path, form: str) -> None:
+    path = tmp_path / "a.snd"
+    sound = SOUND[:, :1] if form == "HTK" else SOUND
+    write(path, form, "PCM_16", sound)
+    expected, _ = soundfile.read(path, dtype="int32", always_2d=True)
+    file = AudioFile(path)
+    assert np.array_equal(file.read(file.frames), expected.T) and file.frames == len(sound)
+    assert file.remark == f"{path}: the length of {form} is not verified; the file may be truncated"
+    file.close()
+
+
+def test_bytes_behind_the_end(tmp_path: Path) -> None:
+    path = tmp_path / "a.ogg"
+    path.write_bytes(write(path, "OGG", "VORBIS") + b"x" * 500)
+    file = AudioFile(path)
+    assert "500 bytes behind the end" in file.remark
+    file.close()
 
 
 def test_standard_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
