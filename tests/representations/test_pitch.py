@@ -368,6 +368,9 @@ def test_copies_may_be_changed_and_discarded() -> None:
         {"pi_medianOrder": 0},
         {"pi_medianOrder": 100},
         {"pi_medianOrder": 2.5},
+        {"pi_peakRatio": 0.0},
+        {"pi_peakRatio": 1.01},
+        {"pi_peakRatio": math.nan},
     ],
     ids=str,
 )
