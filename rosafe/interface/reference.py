@@ -44,9 +44,10 @@ synthetic vowels (random formants, four glottal pulses, fixed and gliding pitch,
 | preset | 0.86 | 1.00 | 0.98 | 1.00 | 1.00 | 1.00 | 1.00 |
 | highest peak, `ac_K` = 2 | 0.74 | 1.00 | 1.00 | 1.00 | 0.98 | 0.90 | 0.87 |
 
-With windows of 64 ms, `librosa.pyin` reaches 1.00 in every column; it also uses the continuity of the pitch. `pi_peakRatio` below 1 finds high pitches in place of the octave below, and in noise sometimes the octave
-above low pitches: in 42 other vowels at 20, 10 and 5 dB, the share is 0.90 from 180 to 250 Hz (0.99 with the settings
-of the last row) and 0.88 from 80 to 120 Hz (0.89). For voices that stay below 250 Hz, set `pi_peakRatio` to 1.
+With windows of 64 ms, `librosa.pyin` reaches 1.00 in every column; it also uses the continuity of the pitch.
+`pi_peakRatio` below 1 finds high pitches in place of the octave below, and in noise sometimes the octave above low
+pitches: in 42 other vowels at 20, 10 and 5 dB, the share is 0.90 from 180 to 250 Hz (0.99 with the settings of the last
+row) and 0.88 from 80 to 120 Hz (0.89). For voices that stay below 250 Hz, set `pi_peakRatio` to 1.
 
 In two synthetic sentences and two recordings of speech, 82 to 94 % of the frames that `pyin` takes as voiced are within
 50 cents of it. In a synthetic voice of 280 Hz (espeak-ng es+f1), 45 % of these frames are an octave below `pyin`. The
