@@ -85,12 +85,12 @@ def _service(client: Client, about: dict[str, Any], name: str, service: dict[str
         ack, callback = options.get("ack"), options.get("callback")
         if not ack and not callback and not service["activity"]:
             return _outputs(full_name, client.get(f"/call/{place}", **query, **form))
-        flags = {"ack": "1"} if ack else {}  # without it, the id of the request is known at once, for Ctrl-C
-        request = Request(client, full_name, client.send(f"/send/{place}", **query, **flags), form)
-        if not ack and not callback:
-            return _end(request)
-        if ack and request.status is Status.error:
-            return request.result  # raises its error
+        request = Request(client, full_name, client.send(f"/send/{place}", **query), form)
+        if ack or not callback:
+            _wait(request, bool(ack))
+            request.show_warning()
+        if (ack and request.status is Status.error) or not (ack or callback):
+            return request.result or {}  # or raises its error
         if callback:
             request.notify(callback)
         return request
@@ -100,15 +100,17 @@ def _service(client: Client, about: dict[str, Any], name: str, service: dict[str
     return method
 
 
-def _end(request: Request) -> dict[str, Any]:
-    """Wait for the end of an activity and return its outputs; an exception, such as Ctrl-C, aborts it."""
+def _wait(request: Request, ack: bool) -> None:
+    """Wait for the end of an activity, or its start; an exception, such as Ctrl-C, aborts it."""
     try:
-        request.wait()
+        if ack:
+            request.wait_for_start()
+        else:
+            request.wait()
     except BaseException:
         with contextlib.suppress(GenoMError):
             request.abort()
         raise
-    return request.result or {}
 
 
 def _port(client: Client, about: dict[str, Any], name: str, port: dict[str, Any]) -> Callable[..., Any]:

@@ -41,8 +41,6 @@ class Request:
         self._result: dict[str, Any] | None = None
         self._lock = threading.Lock()
         self._state = state
-        if state.get("warning"):
-            warn(name, state["warning"])
 
     @property
     def id(self) -> str:
@@ -80,6 +78,15 @@ class Request:
             status = self._look("wait", ms=str(round(1000 * left)))
             if status is not Status.sent or (end is not None and time.monotonic() >= end):
                 return status
+
+    def wait_for_start(self) -> Status:
+        """Wait until the activity runs or has failed, for at most 75 s, and return the status."""
+        return self._look("wait", ms="75000", ack="1")
+
+    def show_warning(self) -> None:
+        """Show the warning of the component, if there is one."""
+        if self._state.get("warning"):
+            warn(self._name, self._state["warning"])
 
     def abort(self) -> None:
         """Ask the activity to end. Raises GenoMError if the request is not an activity."""

@@ -72,7 +72,7 @@ Answers are JSON; with syntax=tcl they are Tcl dicts, with syntax=packed binary 
 /call/NAME/SERVICE[?input=JSON]  /call/NAME/PORT[/ELEMENT]      waits for the result; an activity returns once it runs
 /call/NAME/request?input=["ild",{{"fb_nChannels":16}}]          builds a representation with all that it needs
 /send/NAME/SERVICE[?input=JSON][&ack][&oneway]                  returns the request's id and status immediately
-/request/status?id=ID  /request/result?id=ID  /request/wait?id=ID[&ms=N]  /request/abort?id=ID  /request/clean?id=ID
+/request/status?id=ID  /request/result?id=ID  /request/wait?id=ID[&ms=N][&ack]  /request/abort?id=ID  /request/clean?id=ID
 /requests
 Every URL accepts s=SESSION. See docs/genomixd.md for details.
 """
@@ -267,8 +267,7 @@ class HttpApi:
         if oneway:
             return _small(request, {})
         if _flag(request, "ack"):
-            await wait_any(sent.acknowledged, timeout=ANSWER_SECONDS)
-            await wait_any(sent.finished, timeout=REFUSAL_SECONDS)
+            await _accepted(sent, ANSWER_SECONDS)
         return _status(request, sent)
 
     def _known(self, request: web.Request) -> Request:
@@ -289,7 +288,10 @@ class HttpApi:
         known, seconds = self._known(request), _milliseconds(request) / 1000
         connection = connection_of(request)
         with self._connections.long_poll(connection):
-            await wait_any(known.finished, connection.gone, timeout=seconds)
+            if _flag(request, "ack"):
+                await _accepted(known, seconds, connection.gone)
+            else:
+                await wait_any(known.finished, connection.gone, timeout=seconds)
         return _status(request, known)
 
     async def _request_abort(self, request: web.Request) -> web.StreamResponse:
@@ -371,6 +373,13 @@ def _syntax(request: web.Request) -> Syntax:
 def _answer_syntax(request: web.Request) -> Syntax:
     """Return the syntax of an answer; JSON for the error about an unknown syntax."""
     return SYNTAXES.get(request.query.get("syntax", "json"), JSON)
+
+
+async def _accepted(sent: Request, seconds: float, *events: asyncio.Event) -> None:
+    """Wait until the activity runs or has failed, for an event, or for some seconds."""
+    await wait_any(sent.acknowledged, *events, timeout=seconds)
+    if sent.acknowledged.is_set():
+        await wait_any(sent.finished, *events, timeout=REFUSAL_SECONDS)
 
 
 def _flag(request: web.Request, name: str) -> bool:

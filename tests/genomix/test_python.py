@@ -259,6 +259,20 @@ def test_an_interrupt_aborts_the_activity(world: World) -> None:
     harness.wait_for(lambda: not live_activities(world, "bass"), what="end of the capture")
 
 
+def test_an_interrupt_before_the_start_aborts_the_activity(g: genomix.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    bass = g.load("bass")
+    ids: list[str] = []
+
+    def interrupted(request: genomix.Request) -> genomix.Status:
+        ids.append(request.id)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(genomix.Request, "wait_for_start", interrupted)
+        bass.Acquire("scene:", ack=True)
+    assert g.get("/request/wait", id=ids[0], ms="60000")["status"] != "sent"
+
+
 def test_threads_share_a_connection(g: genomix.Client) -> None:
     afe = start_tree(g)
     gammatone = afe.gammatonePort("gammatone")
