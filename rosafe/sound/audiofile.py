@@ -191,11 +191,14 @@ class AudioFile:
         if not self.frames:
             raise ValueError("expected samples, got none")
         if self._exact:
-            self.seek(self.frames - 1)
-            if self.read(1).shape[1] != 1:
-                raise ValueError(f"expected {self.frames} frames, got fewer; the file is truncated")
+            self._check_last_frame()
         self.seek(0)
         self.not_finite = self.clipped = 0  # the last frame was read above
+
+    def _check_last_frame(self) -> None:
+        self.seek(self.frames - 1)
+        if self.read(1).shape[1] != 1:
+            raise ValueError(f"expected {self.frames} frames, got fewer; the file is truncated")
 
     def _header(self, size: int) -> Header:
         if not size:
