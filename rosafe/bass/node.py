@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import os
 import threading
 from collections.abc import Callable
 from typing import Any, cast
@@ -166,8 +167,11 @@ class BassNode:
         try:
             server = DedicatedSocket(lambda: self._snapshot, str(host), int(port), self._log_clients)
         except (OSError, OverflowError, ValueError, TypeError) as problem:
-            why = f"cannot serve {host}:{port}: {getattr(problem, 'strerror', None) or problem}"
-            raise ComponentError("::genom::syserr", why, code=getattr(problem, "errno", None) or 22) from None
+            code = getattr(problem, "errno", None) or 22
+            reason = os.strerror(code) if code > 0 and isinstance(problem, OSError) else problem
+            why = f"cannot serve {host}:{port}: {reason}; "
+            why += f"set the ROS parameter {rospy.resolve_name('~socket_port')} or socket_host"
+            raise ComponentError("::genom::syserr", why, code=code) from None
         activity.running()
         rospy.loginfo("DedicatedSocket: serving {}:{}".format(*server.address))
         server.serve(activity.stop_requested)

@@ -319,7 +319,8 @@ def test_dedicated_socket(graph: Graph, bass_node: Process, wav: tuple[str, np.n
     with socket.create_server(("127.0.0.1", port)):
         answer = graph.call("/bass/DedicatedSocket")
     assert answer.genom_exdetail.startswith('{"ex":"::genom::syserr","detail":{"code":98')
-    assert f"cannot serve 127.0.0.1:{port}: Address already in use" in bass_node.err
+    why = f"cannot serve 127.0.0.1:{port}: Address already in use; set the ROS parameter /bass/socket_port or "
+    assert why in bass_node.err
     assert graph.call("/bass/DedicatedSocket").genom_success
     assert graph.call("/bass/DedicatedSocket").genom_success  # the second replaces the first
     wait_for(lambda: live(graph) == ["DedicatedSocket"])
