@@ -72,8 +72,8 @@ Answers are JSON; with syntax=tcl they are Tcl dicts, with syntax=packed binary 
 /call/NAME/SERVICE[?input=JSON]  /call/NAME/PORT[/ELEMENT]      waits for the result; an activity returns once it runs
 /call/NAME/request?input=["ild",{{"fb_nChannels":16}}]          builds a representation with all that it needs
 /send/NAME/SERVICE[?input=JSON][&ack][&oneway]                  returns the request's id and status immediately
-/request/status?id=ID  /request/result?id=ID  /request/wait?id=ID[&ms=N][&ack]  /request/abort?id=ID  /request/clean?id=ID
-/requests
+/request/status?id=ID  /request/result?id=ID  /request/wait?id=ID[&ms=N][&ack]
+/request/abort?id=ID  /request/clean?id=ID  /requests
 Every URL accepts s=SESSION. See docs/genomixd.md for details.
 """
 
