@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rosafe.declarations.text import short_repr
+
 FloatArray = NDArray[np.float64]
 
 EPSILON = 2.2204e-16  # machine epsilon, with the digits of the original's source
@@ -21,6 +23,18 @@ TINY = 1e-200
 SQUARE_TINY = 1e-145  # the same for samples that are squared and weighted
 
 FLUSH_INTERVAL = 4096  # samples between two checks of a filter's state, which may become denormal in a long block
+
+
+def as_numbers(name: str, values: Any) -> FloatArray:
+    """Return an array_like of real numbers as float64; ValueError, which begins with `name`, for other values."""
+    try:
+        array = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        array = np.empty(0, object)
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"{name}: expected real numbers, got {short_repr(values)}")
+    with np.errstate(over="ignore"):  # a long double beyond the range of double becomes infinite
+        return array.astype(np.float64, copy=False)
 
 
 def clamp(block: FloatArray, tiny: float = TINY) -> FloatArray:

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rosafe.declarations.text import short_repr
-from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.dsp.numeric_limits import FloatArray, as_numbers
 from rosafe.interface.arguments import check_parameters
 from rosafe.offline.stream import Stream
+from rosafe.representations import STAGES
 
 KINDS = ("itd", "ild", "ic", "ratemap")  # the representations that localization needs
 # Sound is amplified by 100 dB: the representations add a small constant to energies, which would matter at low levels.
@@ -49,7 +50,10 @@ def describe(sample_rate: float, parameters: Mapping[str, Any] | None) -> dict[s
 
 def model_parameters(described: Mapping[str, Any]) -> dict[str, Any]:
     """Return the parameters that a model depends on: all but the normalization of integer input."""
-    return {name: value for name, value in described["parameters"].items() if not name.startswith("in_")}
+    values = described["parameters"]
+    for stage in STAGES.values():  # such that they can be given again: a list of channels has an fb_nERBs of 0
+        values = stage.request_values(values)
+    return {name: value for name, value in values.items() if not name.startswith("in_")}
 
 
 class Cues(NamedTuple):
@@ -110,7 +114,7 @@ def check_features(features: Mapping[str, Any], channels: int) -> dict[str, Floa
     missing = [kind for kind in KINDS if kind not in features]
     if missing:
         raise ValueError(f"features: expected {', '.join(KINDS)}, got none for {', '.join(missing)}")
-    arrays = {kind: np.asarray(features[kind], np.float64) for kind in KINDS}
+    arrays = {kind: as_numbers(f"features[{kind!r}]", features[kind]) for kind in KINDS}
     frames = arrays["itd"].shape[-1] if arrays["itd"].ndim else -1
     for kind, array in arrays.items():
         shape = (2, channels, frames) if kind == "ratemap" else (channels, frames)

@@ -15,7 +15,7 @@ import scipy.signal
 from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.erb import bandwidth
-from rosafe.dsp.numeric_limits import LIMIT, FloatArray
+from rosafe.dsp.numeric_limits import LIMIT, FloatArray, as_numbers
 from rosafe.localization import angles
 from rosafe.localization.filters import HOP, HeadFilters, SourceRenderer
 from rosafe.localization.sofa import MAX_NUMBERS, MAX_RATE, MIN_RATE, read_sofa
@@ -252,7 +252,7 @@ class Head:
         return self._cues(frequencies, azimuths)[1]
 
     def _cues(self, frequencies: Any, azimuths: Any) -> tuple[FloatArray, FloatArray]:
-        centers = np.atleast_1d(np.asarray(frequencies, np.float64))
+        centers = np.atleast_1d(as_numbers("frequencies", frequencies))
         rate = self._rate
         if centers.ndim != 1 or not (np.isfinite(centers).all() and (centers > 0).all() and (centers < rate / 2).all()):
             raise ValueError(

@@ -12,7 +12,7 @@ import numpy as np
 from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.copies import OwnState
-from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.dsp.numeric_limits import FloatArray, as_numbers
 from rosafe.localization import angles, cues
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.evidence import EvidenceWindow
@@ -183,7 +183,7 @@ class Localizer(OwnState):
             Features of the wrong shape, or that are not finite; nothing has changed.
         """
         arrays = cues.check_features(features, self.model.channels)
-        times = np.asarray(time, np.float64)
+        times = as_numbers("time", time)
         if times.shape != arrays["itd"].shape[1:]:
             raise ValueError(f"time: expected shape {arrays['itd'].shape[1:]}, got {times.shape}")
         if not (np.abs(times) <= angles.MAX_TIME).all():
@@ -294,7 +294,7 @@ def yaw_at(head_yaw: Any, times: FloatArray) -> FloatArray:
         raise ValueError(f"head_yaw: expected a number or a list of [time, degrees], got {short_repr(head_yaw)}")
     try:
         points = np.asarray(head_yaw, np.float64)
-    except (TypeError, ValueError):  # ragged, or not numbers
+    except (TypeError, ValueError, OverflowError):  # ragged, or not numbers
         points = np.empty(0)
     if points.ndim != 2 or points.shape[1] != 2 or not len(points) or not np.isfinite(points).all():
         raise ValueError(f"head_yaw: expected finite [time, degrees], got {short_repr(head_yaw)}")

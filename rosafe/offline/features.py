@@ -14,12 +14,14 @@ import scipy.signal
 
 from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import join_names, short_repr
+from rosafe.dsp.numeric_limits import as_numbers
 from rosafe.interface.remarks import unknown_argument
 from rosafe.offline.process import ProcessCall, process
 from rosafe.offline.result import Result
 from rosafe.tree.workers import workers_to_use
 
 _TINY = float(np.finfo(np.float64).tiny)
+_MAX_VALUE = 1e200  # sums of larger ones can overflow
 
 
 def to_db(
@@ -71,8 +73,10 @@ def to_db(
     if floor is not None and not is_number(floor):
         raise ValueError(f"floor: expected a finite number of dB or None, got {short_repr(floor)}")
     with np.errstate(divide="ignore"):
-        levels = (10.0 if power else 20.0) * np.log10(array / array.dtype.type(one))
-    return levels if floor is None else np.maximum(levels, array.dtype.type(floor))
+        # A difference of logarithms, of at least double precision: a ratio can be out of range.
+        logarithms = np.log10(array, dtype=np.promote_types(array.dtype, np.float64))
+    levels = (10.0 if power else 20.0) * (logarithms - np.log10(one))
+    return np.asarray(levels if floor is None else np.maximum(levels, floor), array.dtype)
 
 
 def deltas(values: npt.ArrayLike, width: int = 9, order: int = 1, axis: int = -1) -> npt.NDArray[np.float64]:
@@ -100,8 +104,8 @@ def deltas(values: npt.ArrayLike, width: int = 9, order: int = 1, axis: int = -1
     Raises
     ------
     ValueError
-        For an unsuitable width, order or axis, and for values that are not finite, such as the pitch of unvoiced
-        frames.
+        For an unsuitable width, order or axis, and for values that are not numbers up to 1e200, such as the pitch of
+        unvoiced frames.
 
     Examples
     --------
@@ -109,14 +113,15 @@ def deltas(values: npt.ArrayLike, width: int = 9, order: int = 1, axis: int = -1
     >>> rosafe.deltas(2.0 * np.arange(10)).round(9)
     array([2., 2., 2., 2., 2., 2., 2., 2., 2., 2.])
     """
-    array = np.asarray(values, np.float64)
+    array = as_numbers("values", values)
     for name, number in (("width", width), ("order", order), ("axis", axis)):
         if not isinstance(number, (int, np.integer)) or isinstance(number, bool):
             raise ValueError(f"{name}: expected an integer, got {short_repr(number)}")
     if not -array.ndim <= axis < array.ndim:
         raise ValueError(f"axis: expected one of the {array.ndim} axes of values, got {axis}")
-    if not np.isfinite(array).all():
-        raise ValueError("values: expected finite numbers, got NaN or infinite ones; replace them first")
+    if not (np.abs(array) <= _MAX_VALUE).all():
+        expected = f"finite numbers up to {_MAX_VALUE:g}"
+        raise ValueError(f"values: expected {expected}, got larger ones, NaN or infinity; replace them first")
     frames = array.shape[axis]
     if order < 1 or width % 2 != 1 or not max(3, order + 1) <= width <= frames:
         raise ValueError(

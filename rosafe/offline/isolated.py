@@ -94,7 +94,7 @@ def check_size(taken: float, size: int) -> None:
 def open_h5(descriptor: int) -> tuple[dict[str, Any], list[Array]]:
     """Return the attributes and the arrays of an HDF5 file; ValueError for references to other files."""
     file = _h5_file(descriptor)
-    return _h5_attributes("the file", file), [_h5_array(file, name) for name in file]
+    return _h5_attributes("the file", file), [_h5_array(file, name) for name in _h5_names(file)]
 
 
 def _h5_file(descriptor: int) -> Any:
@@ -105,6 +105,11 @@ def _h5_file(descriptor: int) -> Any:
     if len(file) > MAX_ARRAYS:
         raise ValueError(f"expected at most {MAX_ARRAYS} objects, got {len(file)}")
     return file
+
+
+def _h5_names(of: Any) -> list[str]:
+    """Return names of objects or attributes; h5py returns bytes for those that are not UTF-8."""
+    return [name.decode("utf-8", "surrogateescape") if isinstance(name, bytes) else name for name in of]
 
 
 def _allow_no_more_files() -> None:
@@ -122,9 +127,10 @@ def _h5_array(file: Any, name: str, other_attributes: bool = False) -> Array:
     from h5py import h5d, h5o, h5s, h5t, h5z
 
     shown = name if name.replace(".", "_").isidentifier() else _quoted(name)
-    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+    key = name.encode("utf-8", "surrogateescape")
+    if not isinstance(file.get(key, getlink=True), h5py.HardLink):
         raise ValueError(f"{shown}: expected an array, got a link")
-    found = h5o.open(file.id, name.encode("utf-8", "surrogateescape"))
+    found = h5o.open(file.id, key)
     name = shown
     if not isinstance(found, h5d.DatasetID):
         raise ValueError(f"{name}: expected an array")
@@ -163,8 +169,9 @@ def _h5_attributes(name: str, of: Any, others: bool = False) -> dict[str, Any]:
     from h5py import h5s, h5t
 
     found: dict[str, Any] = {}
-    for attribute in of.attrs:
-        one = of.attrs.get_id(attribute)
+    for attribute in _h5_names(of.attrs):
+        key = attribute.encode("utf-8", "surrogateescape")
+        one = of.attrs.get_id(key)
         kind, space = one.get_type().get_class(), one.get_space().get_simple_extent_type()
         if kind not in (h5t.INTEGER, h5t.FLOAT, h5t.STRING) or space == h5s.NULL:
             if others:
@@ -173,7 +180,7 @@ def _h5_attributes(name: str, of: Any, others: bool = False) -> dict[str, Any]:
         texts = one.get_space().get_simple_extent_npoints() if kind == h5t.STRING else 0
         if one.get_storage_size() > MAX_TEXT or texts > MAX_TEXTS:
             raise ValueError(f"{name}: expected attributes of at most {MAX_TEXT // 2**20} MiB, got a larger one")
-        value = of.attrs[attribute]
+        value = of.attrs[key]
         value = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
         found[attribute] = value.decode(errors="replace" if others else "strict") if isinstance(value, bytes) else value
     return found
@@ -386,7 +393,7 @@ def answer(descriptor: int) -> None:
     """Write the parts of an HDF5 file that the standard input asks for."""
     size, file = _size_on_disk(descriptor), _h5_file(descriptor)
     arrays, described = {}, []
-    for name in file:
+    for name in _h5_names(file):
         try:
             arrays[name] = _h5_array(file, name, other_attributes=True)
             described.append({**_described(arrays[name]), "name": name})

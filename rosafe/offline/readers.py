@@ -91,7 +91,9 @@ def _read_array(file: zipfile.ZipFile, member: zipfile.ZipInfo, expected: tuple[
             raise ValueError(f"{member.filename[:80]!r}: expected the shape {expected}, got {short_repr(shape)}")
         size = math.prod(shape) * dtype.itemsize
         if member.file_size != len(version) + width + length + size or (shape and dtype.kind == "U"):
-            raise ValueError(f"{member.filename[:80]!r}: expected {size} bytes by its shape, got another length")
+            raise ValueError(
+                f"{member.filename[:80]!r}: expected {short_repr(size)} bytes by its shape, got another length"
+            )
         array = new_array(shape, dtype, "F" if header[2] == "True" else "C")
         _fill(content, array.reshape(-1, order="A").view(np.uint8).data if size else memoryview(b""))
         if dtype.kind == "U":

@@ -23,7 +23,7 @@ from rosafe.dsp.gammatone_synthesis import (
     responses,
     synthesis_responses,
 )
-from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.dsp.numeric_limits import FloatArray, as_numbers
 from rosafe.interface import KINDS
 from rosafe.offline.result import Result
 from rosafe.offline.stream import Stream
@@ -385,7 +385,7 @@ class Resynthesizer(OwnState):
         ValueError
             For channels or a mask of the wrong shape or with other values; nothing has changed.
         """
-        block = np.asarray(channels, np.float64)
+        block = as_numbers("channels", channels)
         count, taps = self._filters.shape
         ears = (1, 2) if self._past is None else (len(self._past),)
         if block.ndim != 3 or block.shape[0] not in ears or block.shape[1] != count:

@@ -102,6 +102,7 @@ def test_sofa_files_with_other_objects(tmp_path: Path) -> None:
         file.create_group("group")
         file["text"], file["link"] = "a text", h5py.SoftLink("/M")
         file.attrs["Title"], file.attrs["Organization"] = h5py.Empty("S1"), np.bytes_(b"T\xfc")
+        file[b"\xff"], file.attrs[b"\xff"] = 1.0, 2.0  # names that are not UTF-8
         file["ReceiverPosition"].attrs["Type"] = h5py.Empty("S1")
     assert rosafe.Head.from_sofa(path).key == expected
 
@@ -399,6 +400,15 @@ def test_texts_that_are_no_description(tmp_path: Path) -> None:
     arrays: dict[str, Any] = small_model({"fb_nChannels": 3})
     for text in ("[" * 10**5, "x" * 2**19, "null", "{", "NaN"):
         refused(DirectionModel.load, _save(tmp_path / "a.head", {**arrays, "description": np.array(text)}))
+
+
+def test_models_of_listed_channels(tmp_path: Path) -> None:
+    parameters = {"fb_cfHz": [500.0, 1000.0, 2000.0]}
+    path = _save(tmp_path / "a.head", small_model(parameters))
+    localizer = rosafe.Localizer(8000, path, parameters=parameters)
+    assert localizer.process(np.zeros((2, 8000)))["posterior"].shape == (99, 72)
+    (values,) = (cues.model_parameters(cues.describe(8000.0, one)) for one in [localizer.model.parameters])
+    assert values == localizer.model.parameters and values["fb_cfHz"] == parameters["fb_cfHz"]
 
 
 def test_the_number_of_channels_of_a_model_is_limited() -> None:

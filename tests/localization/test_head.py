@@ -177,6 +177,10 @@ def _set(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
         (_set("Data.IR", lambda ir: ir[:, :1]), "Data.IR of shape"),
         (_set("Data.IR", None), "the variable Data.IR, got none"),
         (_set("Data.IR", lambda ir: ir * np.nan), "finite numbers"),
+        (
+            _set("SourcePosition", lambda at: at * 1e300),
+            "finite numbers up to 1e+06 in SourcePosition, got larger ones",
+        ),
         (_set("Data.IR", lambda ir: ir * 0), "a peak from 1e-06 to 1e+06, got 0"),
         (_set("Data.IR", lambda ir: ir * 1e200), "a peak from"),
         (_set("Data.IR", lambda ir: ir.astype(complex)), "Data.IR: expected an array of real numbers"),
@@ -186,7 +190,7 @@ def _set(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
         (_set("SourcePosition", lambda p: p * np.array([0.4, 1, 1])), "a gap of"),
         (_set("SourcePosition", lambda p: p[:5]), "36 rows in SourcePosition"),
         (_set("ReceiverPosition", np.zeros((2, 3, 1))), "one receiver on the left"),
-        (_set("Data.Delay", np.array([[0.0, 1e9]])), "delays of at most"),
+        (_set("Data.Delay", np.array([[0.0, 1e5]])), "delays of at most"),
         (_set("SourcePosition", {}), "SourcePosition: expected an array"),
         (_set("position_type", "cylindrical"), "spherical or cartesian SourcePosition, got 'cylindrical'"),
         (_set("position_units", "radian, radian, metre"), "degrees and metres, got 'radian, radian, metre'"),
@@ -256,6 +260,13 @@ def test_azimuths_of_cues_are_checked() -> None:
     for azimuths in (1e308, [np.nan], [[0.0, 1.0]], ["left"]):
         with pytest.raises(ValueError, match="azimuth: expected one finite number or a list"):
             rosafe.Head.sphere().itd([500.0], azimuths)
+
+
+def test_frequencies_of_cues_are_checked() -> None:
+    frequencies: Any
+    for frequencies in (1e308, 0.0, np.nan, 10**400, 1j, {}, "a", [[500.0], [1, 2]], None):
+        with pytest.raises(ValueError, match="frequencies: expected"):
+            rosafe.Head.sphere().ild(frequencies)
 
 
 def test_rendering_nothing() -> None:

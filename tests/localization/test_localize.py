@@ -173,6 +173,7 @@ def test_clipping_is_one_warning(sphere_model: Path) -> None:
         ({"head_yaw": [[-1e300, 1], [1e300, 2]]}, "and times up to 1e+10 s, got [[-1e+300, 1], [1e+300, 2]]"),
         ({"head_yaw": [["a", 1]]}, "head_yaw: expected finite [time, degrees], got [['a', 1]]"),
         ({"head_yaw": [[0, 1], [2]]}, "head_yaw: expected finite [time, degrees], got"),
+        ({"head_yaw": [[0, 10**400]]}, "head_yaw: expected finite [time, degrees], got"),
         ({"head_yaw": [[0, None]]}, "head_yaw: expected finite [time, degrees], got"),
         ({"parameters": 3, "head": "sphere"}, "parameters: expected a dict of names and values, got int"),
         ({"parameters": [], "head": "sphere"}, "parameters: expected a dict of names and values, got list"),

@@ -370,6 +370,10 @@ def test_levels() -> None:
     assert rosafe.to_db(values.astype(np.float32)).dtype == np.float32
     assert (rosafe.to_db(np.zeros(3), reference="max") == -80).all()
     assert rosafe.to_db([1, 10], 10.0).tolist() == [-20.0, 0.0]
+    np.testing.assert_allclose(rosafe.to_db([1e308, 5e-324], 1e-5, None), [6260, 20 * np.log10(5e-324) + 100])
+    np.testing.assert_array_equal(
+        rosafe.to_db(np.array([1e4, 0.0], np.float16), 1e-9), np.array([260, -80], np.float16)
+    )
     bad: Any
     for bad in (0.0, -1.0, "mean", np.nan, np.inf, None, np.ones(3)):
         with pytest.raises(ValueError, match=r"^reference: expected a positive finite number or \"max\", got "):
@@ -400,9 +404,13 @@ def test_deltas() -> None:
     for name, wrong in (("width", 5.0), ("width", None), ("order", 1.5), ("order", True), ("axis", 0.0), ("axis", 2)):
         with pytest.raises(ValueError, match=rf"^{name}: expected .*, got {wrong}$"):
             rosafe.deltas(curve, **{name: wrong})
-    curve[0, 3] = np.nan  # as the pitch of an unvoiced frame
-    with pytest.raises(ValueError, match=r"^values: expected finite numbers, got NaN"):
-        rosafe.deltas(curve)
+    for wrong in (np.nan, 1e308):  # NaN as the pitch of an unvoiced frame
+        curve[0, 3] = wrong
+        with pytest.raises(ValueError, match=r"^values: expected finite numbers up to 1e\+200, got larger ones, NaN"):
+            rosafe.deltas(curve)
+    for wrong in ({}, [1j] * 9, [10**400] * 9, [[0], [0, 1]]):
+        with pytest.raises(ValueError, match=r"^values: expected real numbers, got "):
+            rosafe.deltas(wrong)
 
 
 def test_a_batch_equals_single_calls() -> None:
