@@ -245,6 +245,9 @@ def test_uninstall(tmp_path: Path) -> None:
         assert (done.returncode, done.stderr) == (0, "")
     assert not any(folder.exists() for folder in [*removed, prefix])
     assert all(folder.exists() for folder in kept)
+    del env["HOME"]  # then the home directory of the account, which is not to be changed here
+    done = run("/bin/bash", root / "scripts" / "uninstall", env={**env, "XDG_CACHE_HOME": str(home)})
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize(("argument", "code"), [("-h", 0), ("--help", 0), ("--hlep", 2), ("", 2)])
