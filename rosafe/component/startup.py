@@ -278,7 +278,7 @@ def _await_master(uri: str, received: list[int], patient: str) -> None:
 
 
 _NAME = re.compile(r"__\w+:=")
-_REMAPPING = re.compile(r"(__|[~/]?[A-Za-z])[\w/]*:=")
+_REMAPPING = re.compile(r"(__?|[~/])?[A-Za-z][\w/]*:=")  # _seconds:=0.5 sets a parameter of the node
 
 
 def without_names(arguments: list[str]) -> list[str]:

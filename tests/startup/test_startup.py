@@ -371,6 +371,12 @@ def test_master_and_address_by_remapping(graph: Graph) -> None:
         assert "127.0.0.2" in graph.run("rosservice", "uri", "/mapped/kill").stdout
 
 
+def test_a_parameter_of_the_localizer_on_its_command_line(graph: Graph) -> None:
+    done = graph.run("rosafe", "localize", "--name", "mapped_localizer", "_seconds:=-2", "__ns:=of", check=False)
+    assert "seconds: expected" in done.stderr and "-2" in done.stderr and "SOUND" not in done.stderr, done
+    assert done.returncode == 1
+
+
 # --- background -------------------------------------------------------------------------------------------------
 
 
