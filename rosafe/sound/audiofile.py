@@ -97,7 +97,7 @@ class _Presented(io.FileIO):
         return super().seek(self._size + offset) if whence == os.SEEK_END else super().seek(offset, whence)
 
     def readinto(self, buffer: Any) -> int:
-        """Fill `buffer`. Behind the end of the file are no bytes, except zeros in place of a tag."""
+        """Fill `buffer`; behind the end of the file, with zeros in place of a tag only."""
         at, target = self.tell(), memoryview(buffer).cast("B")
         count = super().readinto(target) or 0
         for place, byte in enumerate(self._patch, self._offset - at):
@@ -110,7 +110,7 @@ class _Presented(io.FileIO):
 
 
 class AudioFile:
-    """A sound file, read from disk in parts: WAV, RF64, W64, AIFF, AU, CAF, NIST, FLAC, Ogg and MP3.
+    """A sound file, read from disk in parts: WAV, RF64, W64, AIFF, AU, CAF, NIST, FLAC, Ogg, MP3, and others.
 
     The length of coded sound is that of the decoded samples, which are counted when the file is opened. The length that
     a header states is compared with the file. `read` returns the whole sound, or an error is raised, or `remark` names
@@ -131,7 +131,8 @@ class AudioFile:
     floats : bool
         Whether `read` returns float64.
     remark : str
-        One line about bytes behind the sound that are not read; '' if there are none.
+        One line about sound that may be missing, bytes behind the sound, or a length that cannot be verified, as of
+        VOC; otherwise ''.
     not_finite : int
         Number of samples read so far that were NaN or infinite.
     clipped : int

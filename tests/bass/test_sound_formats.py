@@ -151,6 +151,29 @@ def test_mp3_without_length(tmp_path: Path) -> None:
 
 
 @NO_MP3
+def test_mp3_without_length_and_with_data_behind_it(tmp_path: Path) -> None:
+    noise = 0.3 * np.random.default_rng(1).standard_normal((FRAMES, 2))
+    data = b"".join(mpeg_frames(write(tmp_path / "a.mp3", "MP3", "MPEG_LAYER_III", noise))[1:])  # without the Xing frame
+    (tmp_path / "plain.mp3").write_bytes(data)
+    path = tmp_path / "zeros.mp3"
+    path.write_bytes(data + bytes(5000))
+    file = AudioFile(path)
+    assert "may be truncated" in file.remark or "behind the end" in file.remark
+    assert np.array_equal(file.read(file.frames), whole(tmp_path / "plain.mp3"))
+    file.close()
+
+
+@NO_MP3
+def test_mp3_with_length_and_without_its_last_bytes(tmp_path: Path) -> None:
+    path = tmp_path / "cut.mp3"
+    path.write_bytes(write(tmp_path / "a.mp3", "MP3", "MPEG_LAYER_III")[:-1])
+    file = AudioFile(path)
+    assert file.frames < AudioFile(tmp_path / "a.mp3").frames
+    assert "the last frame of MPEG may be missing" in file.remark
+    file.close()
+
+
+@NO_MP3
 def test_mp3_with_length(tmp_path: Path) -> None:
     data = write(tmp_path / "a.mp3", "MP3", "MPEG_LAYER_III")
     assert abs(whole(tmp_path / "a.mp3").shape[1] - FRAMES) <= 1152
