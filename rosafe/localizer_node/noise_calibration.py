@@ -17,7 +17,7 @@ WARM_UP = 2
 
 
 def default_path() -> Path | None:
-    """Return the file that is used if no other is named; None if there is no cache folder of this user alone."""
+    """Return the file that is used if no other is named; None without a cache folder of this user alone."""
     folder = model_cache.folder()
     path = folder / "noise.json" if folder else None
     return None if path is None or path.is_symlink() or foreign(path) else path
