@@ -226,7 +226,7 @@ $W(f)$ of Stern et al. (1988); `precedence_itd` is the lag of its maximum, and `
 energies
 in dB.
 
-Agreement with the model: with the defaults, the lead dominates for an echo of -6 dB after 1 to 8 ms, and of -3 dB up to about
+Agreement: with the defaults, the lead dominates for an echo of -6 dB after 1 to 8 ms, and of -3 dB up to about
 5 ms; with `prec_wSizeSec` = 0.05, of -3 dB up to 8 ms. For an echo of equal level it holds in part, best at 3 ms. If
 the echo is louder, the results follow the echo. The model of Braasch (2013) finds the lead in all of these cases: it
 analyses the whole sound at once. [Published figures](../figures.md) compares both.""",

@@ -153,7 +153,9 @@ def test_mp3_without_length(tmp_path: Path) -> None:
 @NO_MP3
 def test_mp3_without_length_and_with_data_behind_it(tmp_path: Path) -> None:
     noise = 0.3 * np.random.default_rng(1).standard_normal((FRAMES, 2))
-    data = b"".join(mpeg_frames(write(tmp_path / "a.mp3", "MP3", "MPEG_LAYER_III", noise))[1:])  # without the Xing frame
+    data = b"".join(
+        mpeg_frames(write(tmp_path / "a.mp3", "MP3", "MPEG_LAYER_III", noise))[1:]
+    )  # without the Xing frame
     (tmp_path / "plain.mp3").write_bytes(data)
     path = tmp_path / "zeros.mp3"
     path.write_bytes(data + bytes(5000))
