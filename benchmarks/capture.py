@@ -22,8 +22,8 @@ import report
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
-from rosafe.component import generate  # noqa: E402
-from rosafe.transport.master import PrivateMaster  # noqa: E402
+from rosafe.ros1.component import generate  # noqa: E402
+from rosafe.ros1.transport.master import PrivateMaster  # noqa: E402
 
 RATE, CHUNK = 44100, 2205
 WINDOWS = (0.2, 1.0, 10.0, 60.0)  # s
@@ -84,7 +84,7 @@ def main() -> None:
         import rosservice
         import soundfile
 
-        from rosafe.component import serialization
+        from rosafe.ros1.component import serialization
 
         noise = np.random.default_rng(0).integers(-(2**15), 2**15, (10 * RATE, 2)).astype(np.int16)
         soundfile.write(f"{folder}/noise.wav", noise, RATE)

@@ -35,7 +35,7 @@ import yardstick  # noqa: E402
 import rosafe  # noqa: E402
 from rosafe.dsp import kernels  # noqa: E402
 from rosafe.dsp.windows import window  # noqa: E402
-from rosafe.offline import chain  # noqa: E402
+from rosafe.processing import chain  # noqa: E402
 from rosafe.representations import STAGES  # noqa: E402
 from rosafe.representations.filterbank import Filterbank  # noqa: E402
 from rosafe.representations.registry import CORE_KINDS  # noqa: E402

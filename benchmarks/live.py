@@ -18,9 +18,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from rosafe.component import generate
+from rosafe.ros1.component import generate
 from tests.harness import shared_graph
-from tests.live.world import Live, live, page
+from tests.web.live.world import Live, live, page
 
 KEYS = (
     {"what": "levels"},

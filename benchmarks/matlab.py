@@ -18,8 +18,8 @@ from contextlib import closing
 import graph
 import report
 
-from rosafe.component import generate
 from rosafe.demo.processes import ProcessGroup
+from rosafe.ros1.component import generate
 
 FILL_SECONDS = 2.0  # until the ports hold one second
 UP_SECONDS = 20.0

@@ -23,9 +23,9 @@ import graph
 import numpy as np
 from report import Report, arguments
 
-from rosafe.component import generate
 from rosafe.interface import CORE_REPRESENTATIONS
-from rosafe.transport.buffer_list import BufferList
+from rosafe.ros1.component import generate
+from rosafe.ros1.transport.buffer_list import BufferList
 
 SETTLE_SECONDS = 5.0  # after this time windows and buffers are full
 UNSUBSCRIBED_SECONDS = 2.0  # in this time the node ends a connection and drops the messages that wait for it
@@ -41,7 +41,7 @@ def times(count: int = 20) -> dict[str, float]:
     from rosAFE.msg import rosAFE_TimeFrequencySignalPortStruct
 
     from rosafe.ros import array_msg
-    from rosafe.transport.publisher import send_pieces
+    from rosafe.ros1.transport.publisher import send_pieces
     from rosafe.tree.sliding_window import SlidingWindow
 
     window = SlidingWindow((2, 31), graph.RATE)

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from rosafe import commands
-from rosafe.version import VERSION
+from rosafe.system.version import VERSION
 
 PROGRAMS = {
     "rosafe": "binaural auditory representations, and tools for the nodes",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from rosafe.component import generate
+from rosafe.ros1.component import generate
 
 
 def main(folder: Path) -> None:

@@ -9,7 +9,7 @@ sys.path.insert(0, str(ROOT))
 from pygments.lexers import TextLexer  # noqa: E402
 from sphinx.application import Sphinx  # noqa: E402
 
-from rosafe.version import VERSION  # noqa: E402
+from rosafe.system.version import VERSION  # noqa: E402
 
 project = "rosAFE in Python"
 copyright = "the rosAFE maintainers"

@@ -12,11 +12,11 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from rosafe.component import generate
 from rosafe.localization import model_cache
+from rosafe.ros1.component import generate
 from tests.harness import shared_graph, wait_for
-from tests.live.browser import Browser, browser
-from tests.live.world import live
+from tests.web.live.browser import Browser, browser
+from tests.web.live.world import live
 
 SHOTS = (
     # name, width, height, theme, selected part

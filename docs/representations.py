@@ -13,7 +13,7 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import rosafe
-from rosafe.bass.sources.scene import Scene
+from rosafe.audio.devices.scene import Scene
 from rosafe.representations.registry import builtin_stages
 from rosafe.view.axes import style
 

@@ -5,7 +5,7 @@ import sys
 import soundfile
 
 import rosafe
-from rosafe.bass.sources.scene import Scene
+from rosafe.audio.devices.scene import Scene
 
 if len(sys.argv) > 1:
     sound, rate = soundfile.read(sys.argv[1])  # (N, 2)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from rosafe.version import VERSION as __version__
+from rosafe.system.version import VERSION as __version__
 
 __all__ = [
     "PRESETS",
@@ -41,12 +41,12 @@ if TYPE_CHECKING:
     from rosafe.localization.head import Head
     from rosafe.localization.localize import localize
     from rosafe.localization.localizer import Localizer
-    from rosafe.offline.features import deltas, process_batch, to_db
-    from rosafe.offline.formats import load
-    from rosafe.offline.process import process
-    from rosafe.offline.result import Result
-    from rosafe.offline.resynthesis import Resynthesizer, resynthesize
-    from rosafe.offline.stream import Stream
+    from rosafe.processing.features import deltas, process_batch, to_db
+    from rosafe.processing.process import process
+    from rosafe.processing.resynthesis import Resynthesizer, resynthesize
+    from rosafe.processing.stream import Stream
+    from rosafe.results.formats import load
+    from rosafe.results.result import Result
     from rosafe.view.dataset import to_xarray
     from rosafe.view.plot import plot
 
@@ -55,19 +55,19 @@ _MODULES = {
     "Head": "rosafe.localization.head",
     "Localizer": "rosafe.localization.localizer",
     "PRESETS": "rosafe.interface.remarks",
-    "Result": "rosafe.offline.result",
-    "Resynthesizer": "rosafe.offline.resynthesis",
-    "Stream": "rosafe.offline.stream",
-    "deltas": "rosafe.offline.features",
+    "Result": "rosafe.results.result",
+    "Resynthesizer": "rosafe.processing.resynthesis",
+    "Stream": "rosafe.processing.stream",
+    "deltas": "rosafe.processing.features",
     "direction_mask": "rosafe.localization.enhancement",
     "enhance": "rosafe.localization.enhancement",
-    "load": "rosafe.offline.formats",
+    "load": "rosafe.results.formats",
     "localize": "rosafe.localization.localize",
     "plot": "rosafe.view.plot",
-    "process": "rosafe.offline.process",
-    "process_batch": "rosafe.offline.features",
-    "resynthesize": "rosafe.offline.resynthesis",
-    "to_db": "rosafe.offline.features",
+    "process": "rosafe.processing.process",
+    "process_batch": "rosafe.processing.features",
+    "resynthesize": "rosafe.processing.resynthesis",
+    "to_db": "rosafe.processing.features",
     "to_xarray": "rosafe.view.dataset",
 }
 

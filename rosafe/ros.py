@@ -16,15 +16,15 @@ _LINE = struct.Struct("<IIQd")  # a message: the stamp in s and ns, the frame in
 
 
 def array_msg(generated: Any) -> Any:
-    """Return the message class with arrays for a generated one; see `rosafe.component.serialization.array_msg`."""
-    from rosafe.component import serialization  # requires ROS and generated messages
+    """Return the message class with arrays for a generated one; see `rosafe.ros1.component.serialization.array_msg`."""
+    from rosafe.ros1.component import serialization  # requires ROS and generated messages
 
     return serialization.array_msg(generated)
 
 
 def array_srv(generated: Any) -> Any:
-    """Return the service class with arrays for a generated one; see `rosafe.component.serialization.array_srv`."""
-    from rosafe.component import serialization
+    """Return the service class with arrays for a generated one; see `rosafe.ros1.component.serialization.array_srv`."""
+    from rosafe.ros1.component import serialization
 
     return serialization.array_srv(generated)
 
@@ -70,7 +70,7 @@ class FrameClock:
     def __init__(self, node: str = "rosAFE") -> None:
         import rospy
 
-        from rosafe.component import generate
+        from rosafe.ros1.component import generate
 
         generate.ensure_messages()
         from rosAFE.msg import rosAFE_frameTime

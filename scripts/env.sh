@@ -33,12 +33,12 @@ _rosafe_root=${_rosafe_root%/scripts/env.sh}
 _rosafe_path=$(printf '%s' "$_rosafe_root" | tr '\n' ':')
 if [ "$_rosafe_path" != "${_rosafe_path%%:*}" ]; then
   echo "rosafe: checkout: expected a path without : and line breaks, which separate folders in PATH and PYTHONPATH, got $_rosafe_path; rename or move it" >&2
-elif [ ! -f "$_rosafe_root/rosafe/component/generate.py" ]; then
+elif [ ! -f "$_rosafe_root/rosafe/ros1/component/generate.py" ]; then
   echo "rosafe: the folder of env.sh cannot be determined in this shell; change into the checkout, then: . scripts/env.sh" >&2
 elif [ ! -x /usr/bin/python3 ]; then
   echo "rosafe: /usr/bin/python3 is missing; run $_rosafe_root/scripts/install" >&2
 elif _rosafe_exports=$(PYTHONPATH="$_rosafe_root${PYTHONPATH:+:$PYTHONPATH}" \
-  /usr/bin/python3 -P -m rosafe.component.generate --shell); then
+  /usr/bin/python3 -P -m rosafe.ros1.component.generate --shell); then
   eval "$_rosafe_exports"
   _rosafe_status=0
 fi

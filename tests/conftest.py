@@ -13,24 +13,26 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from rosafe.component import generate
+from rosafe.ros1.component import generate
 from tests import fork_server, harness
-from tests.bass.pulseaudio import PulseServer
+from tests.audio.pulseaudio import PulseServer
 from tests.dsp.implementations import NUMPY, Choice, levels
 
-STARTING = ("cli", "demo", "live", "packaging", "setups")  # folders whose tests start commands, browsers, compilers
-OF_THE_START = ("demo", "packaging", "soak", "startup")  # folders whose tests start programs as users do, not as forks
+# Folders whose tests start commands, browsers, compilers
+STARTING = ("commands", "demo", "web/live", "packaging", "setups")
+# Folders whose tests start programs as users do, not as forks
+OF_THE_START = ("demo", "packaging", "soak", "ros1/startup")
 STARTING_FILES = (  # the same for single files
-    "bass/test_calibration.py",
-    "bass/test_hostile_files.py",
-    "bass/test_record.py",
+    "ros1/bass/test_calibration.py",
+    "audio/test_hostile_files.py",
+    "ros1/bass/test_record.py",
     "eltclsh/test_script.py",
     "eltclsh/test_terminal.py",
-    "genomix/test_decode.py",
-    "genomix/test_front_end.py",
-    "localizer_node/test_recovery.py",
-    "offline/test_damaged.py",
-    "offline/test_examples.py",
+    "web/genomix/test_decode.py",
+    "web/genomix/test_front_end.py",
+    "ros1/localizer/test_recovery.py",
+    "results/test_damaged.py",
+    "processing/test_examples.py",
     "plugins/test_documents.py",
     "plugins/test_faults.py",
     "plugins/test_loading.py",
@@ -45,13 +47,13 @@ LONG_FILES = (  # dozens of seconds of computation; scripts/test --fast has othe
     "localization/test_enhancement.py",
     "localization/test_localize.py",
     "localization/test_noise.py",
-    "offline/test_blocks.py",
-    "offline/test_results.py",
-    "offline/test_resynthesis.py",
+    "processing/test_blocks.py",
+    "results/test_results.py",
+    "processing/test_resynthesis.py",
     "localization/test_tracker.py",
-    "localizer_node/test_calibration.py",
-    "localizer_node/test_long_silence.py",
-    "offline/test_stream.py",
+    "ros1/localizer/test_calibration.py",
+    "ros1/localizer/test_long_silence.py",
+    "processing/test_stream.py",
     "validation/test_validate.py",
     "view/test_figure.py",
     "view/test_plot.py",
@@ -62,11 +64,11 @@ LONGEST_FILES = (  # they begin first, so that no process works on one of them w
     "packaging/test_wheel.py",
     "packaging/test_kernels.py",
     "dsp/test_sanitizers.py",
-    "localizer_node/test_attacks.py",
-    "localizer_node/test_recovery.py",
-    "localizer_node/test_node.py",
-    "ros/test_attacks.py",
-    "startup/test_startup.py",
+    "ros1/localizer/test_attacks.py",
+    "ros1/localizer/test_recovery.py",
+    "ros1/localizer/test_node.py",
+    "ros1/afe/test_attacks.py",
+    "ros1/startup/test_startup.py",
     "demo/test_readme.py",
     "dsp/test_kernels.py",
 )
@@ -78,18 +80,18 @@ NO_KERNELS = (  # tests of stages that have no kernel: the same code runs with k
 )
 EACH_VARIANT = 4  # of the cases of a test, each fourth is repeated with numpy, or with kernels of an older processor
 EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal suite; all with scripts/test --long
-    "cli/test_corpus.py::test_names_that_are_not_utf8": 2,
-    "cli/test_writers.py::test_many_concurrent_writers": 2,
+    "commands/test_corpus.py::test_names_that_are_not_utf8": 2,
+    "commands/test_writers.py::test_many_concurrent_writers": 2,
     "dsp/test_accuracy.py::test_errors_are_within_their_limits": 3,
     "dsp/test_kernels.py::test_autocorrelation": 4,
     "dsp/test_processors.py::test_every_kernel": 3,
-    "genomix/test_guide.py::test_usage_patterns_of_published_scripts": 2,
-    "genomix/test_trouble.py::test_known_components_continue_without_a_master": 2,
-    "localizer_node/test_attacks.py::test_frames_with_strange_values_and_indices": 2,
-    "localizer_node/test_ear_check.py::test_the_command": 2,
-    "localizer_node/test_node.py::test_offline_and_live_agree": 2,
-    "offline/test_examples.py::test_an_example": 2,
-    "offline/test_process.py::test_results_are_freed_with_their_last_reference": 3,
+    "web/genomix/test_guide.py::test_usage_patterns_of_published_scripts": 2,
+    "web/genomix/test_trouble.py::test_known_components_continue_without_a_master": 2,
+    "ros1/localizer/test_attacks.py::test_frames_with_strange_values_and_indices": 2,
+    "ros1/localizer/test_ear_check.py::test_the_command": 2,
+    "ros1/localizer/test_node.py::test_offline_and_live_agree": 2,
+    "processing/test_examples.py::test_an_example": 2,
+    "processing/test_process.py::test_results_are_freed_with_their_last_reference": 3,
     "packaging/test_catkin.py::test_executables": 2,
     "plugins/test_documents.py::test_examples": 2,
     "plugins/test_versions.py::test_a_client_with_another_plugin": 2,
@@ -178,13 +180,13 @@ def small_disk(tmp_path: Path) -> tuple[Path, list[str]]:
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Do not import the tests of whole folders that `scripts/test --fast` excludes."""
     excluded = "not ros" in config.option.markexpr and collection_path.parent == harness.ROOT / "tests"
-    return True if excluded and collection_path.name in STARTING else None
+    return True if excluded and _is_in(collection_path, STARTING) else None
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Select how programs start, before the fixtures of the test are created."""
-    of_the_start = item.path.relative_to(harness.ROOT).parts[1] in OF_THE_START
+    of_the_start = _is_in(item.path, OF_THE_START)
     harness.forks = not of_the_start or item.get_closest_marker("forks") is not None
 
 
@@ -196,7 +198,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         file = item.path.relative_to(harness.ROOT / "tests")
         uses_graph = {"graph", "private_graph", "world"} & set(getattr(item, "fixturenames", ()))
-        if uses_graph or file.parts[0] in STARTING or str(file) in STARTING_FILES:
+        if uses_graph or _is_in(item.path, STARTING) or str(file) in STARTING_FILES:
             item.add_marker("ros")
         only_in_long_runs = item.get_closest_marker("soak") or item.get_closest_marker("exploration")
         if only_in_long_runs or _implementation(item) in ELSEWHERE or str(file) in LONG_FILES:
@@ -208,6 +210,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     slow = {item.path for item in items if item.get_closest_marker("ros") or item.get_closest_marker("long")}
     order = {harness.ROOT / "tests" / file: number - len(LONGEST_FILES) for number, file in enumerate(LONGEST_FILES)}
     items.sort(key=lambda item: order.get(item.path, int(item.path not in slow)))
+
+
+def _is_in(path: Path, folders: tuple[str, ...]) -> bool:
+    """Return whether a file or folder of tests is one of `folders` or in one of them."""
+    return any(path.is_relative_to(harness.ROOT / "tests" / folder) for folder in folders)
 
 
 def pytest_collection_finish() -> None:

@@ -14,7 +14,7 @@ def folder_of(path: str) -> str:
     """Return the folder of a file in rosafe/; `rosafe` for the files of rosafe/ itself."""
     parts = Path(path).parts
     below = parts[parts.index("rosafe") + 1 : -1]
-    return "/".join(below[:1]) or "rosafe"
+    return "/".join(below[: 2 if below[:1] in (("audio",), ("ros1",), ("web",)) else 1]) or "rosafe"
 
 
 def percent(part: int, whole: int) -> str:

@@ -33,11 +33,11 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHON = "/usr/bin/python3"
-NODES = ("rospy", "actionlib", "diagnostic_msgs.msg", "rosafe.transport.registration", "scipy.signal")
+NODES = ("rospy", "actionlib", "diagnostic_msgs.msg", "rosafe.ros1.transport.registration", "scipy.signal")
 MODULES: Mapping[str, Sequence[str]] = {
-    "rosAFE-ros": ("rosafe.node.node", *NODES),
-    "bass-ros": ("rosafe.bass.node", "rosafe.bass.sources.scene", *NODES),
-    "genomixd": ("rosafe.genomix.daemon", *NODES),
+    "rosAFE-ros": ("rosafe.ros1.afe.node", *NODES),
+    "bass-ros": ("rosafe.ros1.bass.node", "rosafe.audio.devices.scene", *NODES),
+    "genomixd": ("rosafe.web.genomix.daemon", *NODES),
     "rosafe": ("rosafe.commands.__main__",),
     "rosmsg": ("rosmsg", "rospy"),
     "rosnode": ("rosnode", "rospy"),
@@ -48,14 +48,14 @@ MODULES: Mapping[str, Sequence[str]] = {
     "rosmaster": ("rosmaster", "rosmaster.main"),
 }
 _SOUNDS = ("scipy.signal", "soundfile")
-_OFFLINE = (*_SOUNDS, "rosafe.offline.files", "rosafe.offline.sounds")
+_OFFLINE = (*_SOUNDS, "rosafe.processing.files", "rosafe.processing.sounds")
 COMMANDS: Mapping[str, Sequence[str]] = {  # what commands of `rosafe` import when they run
     "doctor": _SOUNDS,
     "enhance": _OFFLINE,
-    "localize": (*_OFFLINE, "rosafe.localizer_node.node", *NODES),
+    "localize": (*_OFFLINE, "rosafe.ros1.localizer.node", *NODES),
     "plot": (*_OFFLINE, "matplotlib.figure", "matplotlib.backends.backend_agg"),
     "process": (*_OFFLINE, "h5py", "zarr"),
-    "record": (*_SOUNDS, "rosafe.bass.recording.recorder", "rosafe.bass.sources.scene"),
+    "record": (*_SOUNDS, "rosafe.ros1.bass.recording.recorder", "rosafe.audio.devices.scene"),
     "trace": _OFFLINE,
 }
 SCRIPTS = {name: ROOT / "scripts" / name for name in ("rosAFE-ros", "bass-ros", "genomixd", "rosafe")}

@@ -34,8 +34,8 @@ from urllib.parse import urlsplit
 import pytest
 
 from rosafe import interface
-from rosafe.component import generate
-from rosafe.transport.master import PrivateMaster
+from rosafe.ros1.component import generate
+from rosafe.ros1.transport.master import PrivateMaster
 from tests import fork_server
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -441,7 +441,7 @@ class MasterProcess:
 
     def start(self, env: dict[str, str]) -> None:
         """Start the master and wait until it responds."""
-        from rosafe.transport.master import MasterError, check_master
+        from rosafe.ros1.transport.master import MasterError, check_master
 
         def responds() -> bool:
             assert self.process is not None

@@ -40,109 +40,89 @@ def _of(folder: str) -> Callable[[str, str, str, str, str], Mutation]:
     return lambda name, path, old, new, tests: Mutation(name, f"{folder}/{path}", old, new, tests)
 
 
-_bass, _client, _commands, _component, _declarations, _demo, _dsp, _eltclsh, _genomix, _http, _interface, _live = (
-    _of(f"rosafe/{package}")
-    for package in (
-        *("bass", "client", "commands", "component", "declarations", "demo", "dsp", "eltclsh", "genomix"),
-        *("http_server", "interface", "live"),
+_audio, _commands, _declarations, _demo, _dsp, _eltclsh, _interface, _localization, _processing, _representations = (
+    _of(f"rosafe/{folder}")
+    for folder in (
+        *("audio", "commands", "declarations", "demo", "dsp", "eltclsh", "interface", "localization", "processing"),
+        "representations",
     )
 )
-(
-    _localization,
-    _localizer_node,
-    _node,
-    _offline,
-    _representations,
-    _setups,
-    _sound,
-    _transport,
-    _tree,
-    _validation,
-    _view,
-) = (
-    _of(f"rosafe/{package}")
-    for package in (
-        *(
-            "localization",
-            "localizer_node",
-            "node",
-            "offline",
-            "representations",
-            "setups",
-            "sound",
-            "transport",
-            "tree",
-        ),
-        *("validation", "view"),
-    )
+_results, _ros1, _setups, _tree, _validation, _view, _web = (
+    _of(f"rosafe/{folder}") for folder in ("results", "ros1", "setups", "tree", "validation", "view", "web")
 )
 
 MUTATIONS = (
     # --- bass: capture
-    _bass(
+    _ros1(
         "bass-lost-frames-not-counted",
-        "capture.py",
+        "bass/capture.py",
         "new = chunk.gap + chunk.samples.shape[1]",
         "new = chunk.samples.shape[1]",
-        "tests/bass/test_capture.py",
+        "tests/ros1/bass/test_capture.py",
     ),
-    _bass("bass-writable-view", "capture.py", "view.flags.writeable = False", "pass", "tests/bass/test_capture.py"),
-    _bass(
+    _ros1(
+        "bass-writable-view",
+        "bass/capture.py",
+        "view.flags.writeable = False",
+        "pass",
+        "tests/ros1/bass/test_capture.py",
+    ),
+    _ros1(
         "bass-oldest-frame-off-by-one",
-        "socket_server.py",
+        "bass/socket_server.py",
         "oldest = max(0, last - length + 1)",
         "oldest = max(0, last - length)",
-        "tests/bass/test_socket.py",
+        "tests/ros1/bass/test_socket.py",
     ),
-    _bass(
+    _ros1(
         "bass-inbox-unlimited",
-        "socket_server.py",
+        "bass/socket_server.py",
         "    del inbox[: max(0, len(inbox) - _MAX_REQUEST)]\n",
         "",
-        "tests/bass/test_socket.py",
+        "tests/ros1/bass/test_socket.py",
     ),
-    _bass(
+    _ros1(
         "bass-always-defers-publishing",
-        "capture.py",
+        "bass/capture.py",
         "late * sample_rate > LATE_CHUNKS * frames_per_chunk and self._unpublished * 2 <= self._window.frames",
         "late * sample_rate > LATE_CHUNKS * frames_per_chunk",
-        "tests/bass/test_capture.py",
+        "tests/ros1/bass/test_capture.py",
     ),
     # --- client: requests of genomixd, the live page and Tcl
-    _client(
+    _ros1(
         "client-parameter-given-twice",
-        "values.py",
+        "client/values.py",
         "        if parameter.name in values:\n",
         "        if False:\n",
-        "tests/genomix/test_values.py",
+        "tests/web/genomix/test_values.py",
     ),
-    _client(
+    _ros1(
         "client-missing-parameter",
-        "values.py",
+        "client/values.py",
         "    if missing is not None:\n",
         "    if False:\n",
-        "tests/genomix/test_values.py",
+        "tests/web/genomix/test_values.py",
     ),
-    _client(
+    _ros1(
         "client-range-not-checked",
-        "values.py",
+        "client/values.py",
         "    if not parameter.checked_by_client:",
         "    if True:",
-        "tests/genomix/test_values.py tests/request",
+        "tests/web/genomix/test_values.py tests/ros1/client",
     ),
-    _client(
+    _ros1(
         "client-too-many-arguments",
-        "values.py",
+        "client/values.py",
         "    if len(text_args) > len(service.parameters):\n",
         "    if len(text_args) > len(service.parameters) + 1:\n",
-        "tests/genomix/test_values.py",
+        "tests/web/genomix/test_values.py",
     ),
-    _client(
+    _ros1(
         "client-joins-after-the-end",
-        "graph.py",
+        "client/graph.py",
         "        self.gone.set()  # otherwise `join` may try again, without a session\n",
         "",
-        "tests/genomix/test_node.py -k no_attempt",
+        "tests/web/genomix/test_node.py -k no_attempt",
     ),
     # --- commands
     _commands(
@@ -150,127 +130,127 @@ MUTATIONS = (
         "_meter.py",
         "divmod(round(seconds), 60)",
         "divmod(int(seconds), 60)",
-        "tests/bass/test_recording.py",
+        "tests/ros1/bass/test_recording.py",
     ),
     _commands(
         "meter-mark-of-wrong-ear",
         "_meter.py",
         "any(part.clipped[ear] for part in parts)",
         "any(part.clipped[0] for part in parts)",
-        "tests/bass/test_recording.py",
+        "tests/ros1/bass/test_recording.py",
     ),
     _commands(
         "up-localize-ignored",
         "up.py",
         "if of_setup is None and not options.localize and not options.head and options.mirror is None:",
         "if of_setup is None and not options.head and options.mirror is None:",
-        "tests/cli/test_up.py -k without_a_setup",
+        "tests/commands/test_up.py -k without_a_setup",
     ),
     # --- component
-    _component(
+    _ros1(
         "audio-rate-of-ended-acquisition",
-        "audio.py",
+        "component/audio.py",
         "while self.sample_rate == 0 or time.time() > self._current_until:",
         "while self.sample_rate == 0:",
-        "tests/ros/test_audio_ring.py -k on_its_way",
+        "tests/ros1/afe/test_audio_ring.py -k on_its_way",
     ),
-    _component(
+    _ros1(
         "awaited-blocks-not-read",
-        "audio.py",
+        "component/audio.py",
         "return reader.position <= reader.awaited or now",
         "return now",
-        "tests/ros/test_audio_ring.py -k unobserved",
+        "tests/ros1/afe/test_audio_ring.py -k unobserved",
     ),
-    _component(
+    _ros1(
         "observed-blocks-combined",
-        "audio.py",
+        "component/audio.py",
         "return max(1, most if needed > most else math.ceil(needed))",
         "return max(1, most)",
-        "tests/ros/test_audio_ring.py -k unobserved",
+        "tests/ros1/afe/test_audio_ring.py -k unobserved",
     ),
-    _component(
+    _ros1(
         "early-stamp-ignored",
-        "frame_clock.py",
+        "component/frame_clock.py",
         "if time < line.at(frame):",
         "if False:",
-        "tests/ros/test_frame_time.py",
+        "tests/ros1/afe/test_frame_time.py",
     ),
-    _component(
+    _ros1(
         "plan-kept-for-a-new-subscriber",
-        "audio.py",
+        "component/audio.py",
         "reader.awaited, reader.planned = self._frames.newest, 0",
         "reader.awaited = self._frames.newest",
-        "tests/ros/test_audio_ring.py -k unobserved",
+        "tests/ros1/afe/test_audio_ring.py -k unobserved",
     ),
-    _node(
+    _ros1(
         "new-subscriber-forgotten",
-        "published_tree.py",
+        "afe/published_tree.py",
         "impl.on_subscribers_changed = self._ports.forget_subscribed",
         "impl.on_subscribers_changed = lambda: None",
-        "tests/ros/test_ports.py -k short_blocks",
+        "tests/ros1/afe/test_ports.py -k short_blocks",
     ),
-    _component(
+    _ros1(
         "clock-step-without-limit",
-        "frame_clock.py",
+        "component/frame_clock.py",
         "step = min(STEP_SECONDS, SLEW * (frame - self._last_output.frame) / self._nominal)",
         "step = SLEW * (frame - self._last_output.frame) / self._nominal",
-        "tests/ros/test_frame_time.py",
+        "tests/ros1/afe/test_frame_time.py",
     ),
-    _component(
+    _ros1(
         "clock-set-not-noticed",
-        "frame_clock.py",
+        "component/frame_clock.py",
         "        if time < line.at(frame) - SET_SECONDS:\n            return True\n",
         "",
-        "tests/ros/test_frame_time.py",
+        "tests/ros1/afe/test_frame_time.py",
     ),
-    _component(
+    _ros1(
         "audio-of-old-connection",
-        "audio.py",
+        "component/audio.py",
         "            if connection is not self._connection:\n                return\n",
         "",
-        "tests/ros/test_audio_ring.py",
+        "tests/ros1/afe/test_audio_ring.py",
     ),
-    _component(
+    _ros1(
         "audio-gap-closed",
-        "audio.py",
+        "component/audio.py",
         "                self._frames.append(np.zeros((2, lost), np.int32))\n",
         "                pass\n",
-        "tests/ros/test_audio_ring.py",
+        "tests/ros1/afe/test_audio_ring.py",
     ),
-    _component(
+    _ros1(
         "audio-dropped-not-counted",
-        "audio.py",
+        "component/audio.py",
         "            self.counters.dropped += unread\n",
         "",
-        "tests/ros/test_audio_ring.py",
+        "tests/ros1/afe/test_audio_ring.py",
     ),
-    _component(
+    _ros1(
         "audio-read-without-lock",
-        "audio.py",
+        "component/audio.py",
         "        with self._arrived:\n            if connection is not self._connection:",
         "        if True:\n            if connection is not self._connection:",
-        "tests/ros/test_audio_ring.py tests/ros/test_races.py",
+        "tests/ros1/afe/test_audio_ring.py tests/ros1/afe/test_races.py",
     ),
-    _component(
+    _ros1(
         "activities-one-too-many",
-        "activities.py",
+        "component/activities.py",
         ">= MAX_ACTIVITIES - 1",
         ">= MAX_ACTIVITIES",
-        "tests/ros/test_activities.py",
+        "tests/ros1/afe/test_activities.py",
     ),
-    _component(
+    _ros1(
         "activity-stays-after-failed-start",
-        "activities.py",
+        "component/activities.py",
         "                del self._live[activity.id]\n            raise ComponentError(",
         "                pass\n            raise ComponentError(",
-        "tests/ros/test_activities.py",
+        "tests/ros1/afe/test_activities.py",
     ),
-    _component(
+    _ros1(
         "load-never-reset",
-        "activities.py",
+        "component/activities.py",
         "                self._busy, self._since = 0.0, now\n",
         "                self._since = now\n",
-        "tests/ros/test_activities.py",
+        "tests/ros1/afe/test_activities.py",
     ),
     # --- declarations
     _declarations(
@@ -351,14 +331,14 @@ MUTATIONS = (
         "copies.py",
         "vars(self).update(copy.deepcopy(state))",
         "vars(self).update(state)",
-        "tests/offline/test_copies.py -k 'independently and band'",
+        "tests/processing/test_copies.py -k 'independently and band'",
     ),
     _dsp(
         "copy-with-the-address-of-the-original",
         "kernels/__init__.py",
         "return PinnedArray.of, (self.array,)",
         "return PinnedArray, (self.array, self.address)",
-        "tests/offline/test_copies.py -k 'independently and deepcopy'",
+        "tests/processing/test_copies.py -k 'independently and deepcopy'",
     ),
     _dsp(
         "stage-change-not-atomic",
@@ -419,76 +399,76 @@ MUTATIONS = (
         "tests/eltclsh/test_terminal.py -k tab_completes",
     ),
     # --- genomix
-    _genomix(
+    _web(
         "session-not-in-order",
-        "sessions.py",
+        "genomix/sessions.py",
         "if self.name and call.service is not None:",
         "if False:",
-        "tests/genomix/test_sessions.py",
+        "tests/web/genomix/test_sessions.py",
     ),
-    _genomix(
+    _web(
         "session-events-unlimited",
-        "sessions.py",
+        "genomix/sessions.py",
         "if queue.qsize() < MAX_EVENTS:",
         "if True:",
-        "tests/genomix/test_sessions.py",
+        "tests/web/genomix/test_sessions.py",
     ),
-    _genomix(
+    _web(
         "session-expires-at-once",
-        "sessions.py",
+        "genomix/sessions.py",
         "LINGER_SECONDS if self._listened else IDLE_SECONDS",
         "LINGER_SECONDS",
-        "tests/genomix/test_sessions.py",
+        "tests/web/genomix/test_sessions.py",
     ),
-    _genomix(
+    _web(
         "packed-number-too-large",
-        "binary_format.py",
+        "genomix/binary_format.py",
         "return math.inf if value > 0 else -math.inf",
         "return math.inf",
-        "tests/genomix/test_packed.py tests/genomix/test_decode.py",
+        "tests/web/genomix/test_packed.py tests/web/genomix/test_decode.py",
     ),
-    _genomix(
+    _web(
         "packed-ragged-signal",
-        "binary_format.py",
+        "genomix/binary_format.py",
         "if len(shapes) > 1 or None in shapes:",
         "if None in shapes:",
-        "tests/genomix/test_packed.py tests/genomix/test_decode.py",
+        "tests/web/genomix/test_packed.py tests/web/genomix/test_decode.py",
     ),
     # --- http_server
-    _http(
+    _web(
         "connection-of-another-address-closed",
-        "connections.py",
+        "server/connections.py",
         "_silent_longest([account] if full else self._accounts.values())",
         "_silent_longest(self._accounts.values())",
-        "tests/http_server/test_connections.py",
+        "tests/web/server/test_connections.py",
     ),
-    _http(
+    _web(
         "http-long-polls-unlimited",
-        "connections.py",
+        "server/connections.py",
         "        if len(polls) >= limit:\n",
         "        if False:\n",
-        "tests/http_server/test_connections.py",
+        "tests/web/server/test_connections.py",
     ),
-    _http(
+    _web(
         "http-authenticated-closed-first",
-        "connections.py",
+        "server/connections.py",
         "return self.account.idle if self._authenticated else self.account.silent",
         "return self.account.silent",
-        "tests/http_server/test_connections.py",
+        "tests/web/server/test_connections.py",
     ),
-    _http(
+    _web(
         "http-answers-unlimited",
-        "connections.py",
+        "server/connections.py",
         "        if not self._fits(data, size):\n",
         "        if False:\n",
-        "tests/http_server/test_connections.py",
+        "tests/web/server/test_connections.py",
     ),
-    _http(
+    _web(
         "http-burst-accepted-at-once",
-        "listener.py",
+        "server/listener.py",
         "ACCEPTED_AT_ONCE = 8 ",
         "ACCEPTED_AT_ONCE = BACKLOG ",
-        "tests/http_server/test_connections.py",
+        "tests/web/server/test_connections.py",
     ),
     # --- interface
     _interface(
@@ -502,34 +482,40 @@ MUTATIONS = (
         "tests/interface/test_values.py",
     ),
     # --- live
-    _live(
+    _web(
         "live-page-keeps-deadline",
-        "server.py",
+        "live/server.py",
         "        connection_of(request).request_parsed()\n",
         "",
-        "tests/live/test_failures.py -k deadline",
+        "tests/web/live/test_failures.py -k deadline",
     ),
-    _live(
+    _web(
         "live-any-token",
-        "access.py",
+        "live/access.py",
         "if not hmac.compare_digest(token, self.token.encode()):",
         "if not token:",
-        "tests/live/test_server.py",
+        "tests/web/live/test_server.py",
     ),
-    _live("live-other-origin", "access.py", "        check_same_origin(headers)\n", "", "tests/live/test_server.py"),
-    _live(
+    _web(
+        "live-other-origin",
+        "live/access.py",
+        "        check_same_origin(headers)\n",
+        "",
+        "tests/web/live/test_server.py",
+    ),
+    _web(
         "live-pages-unlimited",
-        "server.py",
+        "live/server.py",
         "if len(self._clients) >= MAX_CLIENTS:",
         "if False:",
-        "tests/live/test_server.py -k limit",
+        "tests/web/live/test_server.py -k limit",
     ),
-    _live(
+    _web(
         "live-columns-too-fast",
-        "plot_data.py",
+        "live/plot_data.py",
         "math.ceil(processor.rate / MAX_COLUMN_RATE - 1e-9)",
         "math.floor(processor.rate / MAX_COLUMN_RATE)",
-        "tests/live/test_plots.py",
+        "tests/web/live/test_plots.py",
     ),
     # --- localization
     _localization(
@@ -579,7 +565,7 @@ MUTATIONS = (
         "model_cache.py",
         "            _by_key.get(key)\n",
         "            None\n",
-        "tests/offline/test_copies.py -k share_its_models",
+        "tests/processing/test_copies.py -k share_its_models",
     ),
     _localization(
         "tracker-never-forgets",
@@ -610,48 +596,48 @@ MUTATIONS = (
         "tests/localization/test_head.py",
     ),
     # --- node
-    _node(
+    _ros1(
         "node-half-restored-tree-stays",
-        "saved_tree.py",
+        "afe/saved_tree.py",
         "            if self._pending is setup:\n                self._tree.stop()\n",
         "",
-        "tests/ros/test_saved_tree.py",
+        "tests/ros1/afe/test_saved_tree.py",
     ),
-    _node(
+    _ros1(
         "node-slow-call-blocks-others",
-        "processor_health.py",
+        "afe/processor_health.py",
         "                self._tree.skip(processor, block)\n",
         "",
-        "tests/plugins/test_node.py tests/ros/test_lag.py",
+        "tests/plugins/test_node.py tests/ros1/afe/test_lag.py",
     ),
     # --- offline
-    _offline(
+    _processing(
         "offline-last-frame-lost",
         "chain.py",
         "-((start - self._frames) // hop)",
         "(self._frames - start) // hop",
-        "tests/offline/test_results.py -k padd",
+        "tests/results/test_results.py -k padd",
     ),
-    _offline(
+    _results(
         "offline-mat-length",
         "mat5.py",
         "if data.end > source.end or data.end - data.start != count * dtype.itemsize:",
         "if data.end > source.end:",
-        "tests/offline/test_damaged.py -k mat5",
+        "tests/results/test_damaged.py -k mat5",
     ),
-    _offline(
+    _results(
         "offline-lags-not-aligned",
         "collector.py",
         "first = (shape[middle] - block.shape[middle]) // 2",
         "first = 0",
-        "tests/offline/test_collector.py tests/offline/test_changes.py",
+        "tests/results/test_collector.py tests/processing/test_changes.py",
     ),
-    _offline(
+    _processing(
         "offline-error-ignored",
         "chain.py",
         "            raise self._listener.error\n",
         "            return\n",
-        "tests/offline/test_process.py tests/offline/test_stream.py",
+        "tests/processing/test_process.py tests/processing/test_stream.py",
     ),
     # --- representations
     _representations(
@@ -714,89 +700,103 @@ MUTATIONS = (
     # --- files and nodes
     Mutation(
         "output-not-locked",
-        "rosafe/output.py",
+        "rosafe/system/output.py",
         "            lock_file(descriptor)\n",
         "",
-        "tests/cli/test_writers.py -k second_writer",
+        "tests/commands/test_writers.py -k second_writer",
     ),
-    _component(
+    _ros1(
         "nohup-not-respected",
-        "startup.py",
+        "component/startup.py",
         "    nohup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN\n",
         "    nohup = False\n",
-        "tests/startup/test_startup.py -k nohup",
+        "tests/ros1/startup/test_startup.py -k nohup",
     ),
     # --- sound
-    _sound(
+    _audio(
+        "device-plugins-unlimited",
+        "devices/pcmname.py",
+        "if plugin not in _PLUGINS:",
+        "if False:",
+        "tests/audio/test_dangerous_names.py tests/audio/test_pcmname.py",
+    ),
+    _audio(
+        "bag-next-stream",
+        "devices/bag.py",
+        "islice(streams, self._stream - 1, None)",
+        "islice(streams, self._stream, None)",
+        "tests/audio/test_bag.py",
+    ),
+    _audio(
         "sound-jump-without-limit",
-        "windows.py",
+        "files/windows.py",
         "MAX_JUMP_SECONDS = 3600.0",
         "MAX_JUMP_SECONDS = 1e9",
-        "tests/bass/test_windows.py",
+        "tests/audio/test_windows.py",
     ),
-    _sound(
+    _audio(
         "sound-infinity-swapped",
-        "audiofile.py",
+        "files/audiofile.py",
         "posinf=1.0, neginf=-1.0",
         "posinf=-1.0, neginf=1.0",
-        "tests/bass/test_file_source.py tests/cli/test_streams.py",
+        "tests/audio/test_file_source.py tests/commands/test_streams.py",
     ),
-    _sound(
+    _audio(
         "sound-truncated-file",
-        "containers.py",
+        "files/containers.py",
         "    if stated > available:\n",
         "    if False:\n",
-        "tests/bass/test_sound_formats.py tests/bass/test_file_source.py",
+        "tests/audio/test_sound_formats.py tests/audio/test_file_source.py",
     ),
     # --- transport
-    _transport(
+    _ros1(
         "request-size-unlimited",
-        "server_limits.py",
+        "transport/server_limits.py",
         "        if size > self._limit:\n",
         "        if False:\n",
-        "tests/ros/test_attacks.py",
+        "tests/ros1/afe/test_attacks.py",
     ),
-    _transport(
+    _ros1(
         "header-size-off-by-one",
-        "server_limits.py",
+        "transport/server_limits.py",
         "if size > HEADER_BYTES:",
         "if size >= HEADER_BYTES:",
-        "tests/ros/test_attacks.py tests/ros/test_handshake_server.py",
+        "tests/ros1/afe/test_attacks.py tests/ros1/afe/test_handshake_server.py",
     ),
-    _transport(
+    _ros1(
         "newest-connection-closed",
-        "handshake_server.py",
+        "transport/handshake_server.py",
         "pending = next(iter(self._pending.values()), None)",
         "pending = next(reversed(self._pending.values()), None)",
-        "tests/ros/test_handshake_server.py",
+        "tests/ros1/afe/test_handshake_server.py",
     ),
-    _transport(
+    _ros1(
         "listener-stays-paused",
-        "handshake_server.py",
+        "transport/handshake_server.py",
         "                self._paused_until = 0.0\n                self._selector.register",
         "                self._selector.register",
-        "tests/ros/test_handshake_server.py",
+        "tests/ros1/afe/test_handshake_server.py",
     ),
-    _transport(
+    _ros1(
         "late-request-ends-the-owner",
-        "succession.py",
+        "transport/succession.py",
         "replaced or owner == address or (owner is None and not self.up)",
         "replaced or (not self.up and owner in (address, None))",
-        "tests/startup/test_succession.py -k ignored",
+        "tests/ros1/startup/test_succession.py -k ignored",
     ),
-    _transport(
+    _ros1(
         "registers-after-the-name-was-lost",
-        "succession.py",
+        "transport/succession.py",
         "            if self.succession.over:\n",
         "            if False:\n",
-        "tests/startup/test_succession.py -k registers_nothing",
+        "tests/ros1/startup/test_succession.py -k registers_nothing",
     ),
-    _transport(
+    _ros1(
         "closed-topic-keeps-message",
-        "publisher.py",
+        "transport/publisher.py",
         "        super().close()\n        self.latch = None\n",
         "        super().close()\n",
-        "tests/ros/test_memory.py",
+        "tests/ros1/afe/test_memory.py",
     ),
     # --- tree
     _tree(
@@ -889,7 +889,7 @@ MUTATIONS = (
         "citing.py",
         "for c in applicable(kind.references, parameters)}",
         "for c in applicable(kind.references, {})}",
-        "tests/cli/test_cite.py",
+        "tests/commands/test_cite.py",
     ),
     _validation(
         "validation-tolerance-ignored",
@@ -906,40 +906,40 @@ MUTATIONS = (
         "tests/validation/test_validate.py",
     ),
     # --- localizer node
-    _localizer_node(
+    _ros1(
         "messages-of-an-earlier-stream",
-        "frame_source.py",
+        "localizer/frame_source.py",
         "if index < self._newest:",
         "if False:",
-        "tests/localizer_node/test_frame_source.py",
+        "tests/ros1/localizer/test_frame_source.py",
     ),
-    _localizer_node(
+    _ros1(
         "successor-loses-its-processors",
-        "tree_link.py",
+        "localizer/tree_link.py",
         "if self._created.names and not registration.registrar().is_replaced:",
         "if self._created.names:",
-        "tests/localizer_node/test_tree_link.py",
+        "tests/ros1/localizer/test_tree_link.py",
     ),
-    _localizer_node(
+    _ros1(
         "localizer-sources-stay",
-        "localization_loop.py",
+        "localizer/localization_loop.py",
         "if self._newest and (self._queue.muted or now - self._used_at > limit):",
         "if False:",
-        "tests/localizer_node/test_node.py -k end_of_the_sound",
+        "tests/ros1/localizer/test_node.py -k end_of_the_sound",
     ),
-    _localizer_node(
+    _ros1(
         "localizer-processors-left-behind",
-        "tree_link.py",
+        "localizer/tree_link.py",
         "            try:\n                await self._created.remove(graph, client)\n",
         "            try:\n                pass\n",
-        "tests/localizer_node/test_recovery.py -k own_processors",
+        "tests/ros1/localizer/test_recovery.py -k own_processors",
     ),
-    _localizer_node(
+    _ros1(
         "localizer-muted-frames-used",
-        "frame_queue.py",
+        "localizer/frame_queue.py",
         "kept = known & ~self._mute.muted(joined.middles[:ready])",
         "kept = known",
-        "tests/localizer_node/test_frame_queue.py",
+        "tests/ros1/localizer/test_frame_queue.py",
     ),
     # --- view
     _view(
@@ -962,14 +962,14 @@ MUTATIONS = (
         "tcl/genomix/request.tcl",
         'if {$Status ne "sent" || [dict get $new status] eq "sent"} {',
         'if {[dict get $new status] eq "sent"} {',
-        "tests/genomix/test_tcl.py",
+        "tests/web/genomix/test_tcl.py",
     ),
     Mutation(
         "tcl-error-reported-though-read",
         "tcl/genomix/request.tcl",
         "        if {$Seen} {\n            return\n        }\n",
         "",
-        "tests/genomix/test_tcl.py",
+        "tests/web/genomix/test_tcl.py",
     ),
     # --- packages
     Mutation(
@@ -1002,7 +1002,7 @@ MUTATIONS = (
     ),
     Mutation(
         "kernels-writable-by-others",
-        "rosafe/trust.py",
+        "rosafe/system/trust.py",
         "found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX",
         "False",
         "tests/packaging/test_kernels.py",

@@ -13,15 +13,16 @@ import sys
 import warnings
 from pathlib import Path
 
-from rosafe import commands, missing, streams
+from rosafe import commands
 from rosafe.commands import CommandError
-from rosafe.component.generate import GenerationError
-from rosafe.component.startup import Parser, without_names, without_remappings
 from rosafe.declarations import plugins
-from rosafe.output import OutputError
-from rosafe.terminal import printable
-from rosafe.transport.master import MasterError
-from rosafe.version import VERSION
+from rosafe.ros1.component.generate import GenerationError
+from rosafe.ros1.component.startup import Parser, without_names, without_remappings
+from rosafe.ros1.transport.master import MasterError
+from rosafe.system import missing, streams
+from rosafe.system.output import OutputError
+from rosafe.system.terminal import printable
+from rosafe.system.version import VERSION
 
 # compute nothing or built-in representations only, or import plugins in a child process
 _WITHOUT_PLUGINS = ("check", "doctor", "record", "trace", "validate")

@@ -13,16 +13,16 @@ from rosafe.commands import CommandError
 from rosafe.interface import ROSAFE, ComponentError
 
 if TYPE_CHECKING:
-    from rosafe.client.component_client import ComponentClient
-    from rosafe.client.graph import Graph
+    from rosafe.ros1.client.component_client import ComponentClient
+    from rosafe.ros1.client.graph import Graph
 
 POLL_SECONDS = 0.2  # between two attempts to reach a component or the master
 
 
 def prepare(wait: float = 0.0) -> None:
     """Generate the messages and wait at most `wait` seconds for a ROS master; GenerationError or MasterError."""
-    from rosafe.component import generate
-    from rosafe.transport import master
+    from rosafe.ros1.component import generate
+    from rosafe.ros1.transport import master
 
     master.set_local_defaults()
     deadline = time.monotonic() + wait
@@ -39,7 +39,7 @@ def prepare(wait: float = 0.0) -> None:
 @asynccontextmanager
 async def open_graph() -> AsyncIterator[Graph]:
     """Provide the graph of the master of this environment."""
-    from rosafe.client.graph import Graph
+    from rosafe.ros1.client.graph import Graph
 
     graph = Graph(os.environ["ROS_MASTER_URI"])
     try:
@@ -65,7 +65,7 @@ async def component(instance: str, wait: float = 0.0) -> AsyncIterator[Component
 
 
 async def _find(graph: Graph, instance: str, wait: float) -> ComponentClient:
-    from rosafe.client.component_client import ComponentClient, names
+    from rosafe.ros1.client.component_client import ComponentClient, names
 
     deadline = time.monotonic() + wait
     while True:

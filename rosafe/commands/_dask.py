@@ -18,8 +18,8 @@ from typing import Any
 
 from rosafe.commands import CommandError
 from rosafe.commands._workers import SIGNAL_SECONDS, Interrupts, TaskReport, Work, attempt
+from rosafe.system.version import VERSION
 from rosafe.tree.workers import VARIABLE
-from rosafe.version import VERSION
 
 LOCAL = "local"
 TASKS_IN_FLIGHT = 8  # tasks submitted to the scheduler for each thread of its workers

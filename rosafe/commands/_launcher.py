@@ -16,12 +16,12 @@ from rosgraph.names import get_ros_namespace
 from rosafe.commands import CommandError
 from rosafe.demo.processes import Child, ProcessGroup
 from rosafe.interface import COMPONENTS, ComponentError
-from rosafe.terminal import printable
-from rosafe.transport import master, paths
+from rosafe.ros1.transport import master, paths
+from rosafe.system.terminal import printable
 
 if TYPE_CHECKING:
-    from rosafe.client.component_client import ComponentClient
-    from rosafe.client.graph import Graph
+    from rosafe.ros1.client.component_client import ComponentClient
+    from rosafe.ros1.client.graph import Graph
 
 START_SECONDS = 30.0
 END_SECONDS = 6.0  # one second more than the servers need
@@ -129,7 +129,7 @@ class Launcher:
 
     async def start_localizer(self, graph: Graph, settings: Mapping[str, Any]) -> None:
         """Use the running localizer or start one with these settings."""
-        from rosafe.client import localizer
+        from rosafe.ros1.client import localizer
 
         node = graph.resolve(localizer.NODE)
         if self.processes["roscore"].child is None and await localizer.is_registered(graph, node):
@@ -182,7 +182,7 @@ async def _answers(uri: str) -> bool:
 
 
 async def _client(graph: Graph, name: str) -> ComponentClient | None:
-    from rosafe.client.component_client import ComponentClient
+    from rosafe.ros1.client.component_client import ComponentClient
 
     try:
         client = await ComponentClient.load(graph, name)
@@ -210,7 +210,7 @@ def _namespace(text: str) -> str:
 
 def environment() -> dict[str, str]:
     """Return the environment of this process with the additions that the children need."""
-    from rosafe.component import generate
+    from rosafe.ros1.component import generate
 
     master.set_local_defaults()
     master.check_family()

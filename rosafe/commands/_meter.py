@@ -8,8 +8,8 @@ from typing import TextIO
 
 import numpy as np
 
-from rosafe.bass.recording.levels import EARS, LevelMeter
-from rosafe.terminal import printable
+from rosafe.audio.files.levels import EARS, LevelMeter
+from rosafe.system.terminal import printable
 
 LIVE_SECONDS = 0.1  # between two updates of the live line
 PLAIN_SECONDS = 1.0  # of sound, between two plain lines

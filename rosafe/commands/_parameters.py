@@ -63,7 +63,7 @@ def head_of(head: str, mirror: bool | None) -> Any:
 
 def ear_channels(text: str) -> tuple[int, int]:
     """Convert the value of --channels, such as ``3,4``."""
-    from rosafe.sound.audiofile import channel_pair
+    from rosafe.audio.files.audiofile import channel_pair
 
     try:
         return channel_pair(text)

@@ -7,7 +7,7 @@ from typing import TextIO
 
 from tqdm import tqdm
 
-from rosafe.terminal import printable
+from rosafe.system.terminal import printable
 
 LIVE_SECONDS = 0.1  # minimum time between two updates of the live line
 PLAIN_SECONDS = 10.0  # minimum time between two plain lines

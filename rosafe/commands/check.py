@@ -12,7 +12,7 @@ import textwrap
 
 from rosafe.commands import CommandError, _plugins
 from rosafe.declarations import plugins
-from rosafe.terminal import printable
+from rosafe.system.terminal import printable
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
     if options.settings and not options.outputs:
         options.usage_error("--set: expected --outputs as well, got none")
     from rosafe.interface import KINDS, citing
-    from rosafe.offline.chain import needed
+    from rosafe.interface.arguments import needed
 
     try:
         names, known = _of_result(Path(results[0])) if results else _of_options(options)
@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _of_result(path: Path) -> tuple[list[str], dict[str, Any]]:
-    from rosafe.offline.formats import load
+    from rosafe.results.formats import load
 
     try:
         result = load(path)
@@ -67,7 +67,7 @@ def _of_result(path: Path) -> tuple[list[str], dict[str, Any]]:
 def _of_options(options: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
     from rosafe.interface import KINDS
     from rosafe.interface.arguments import check_outputs
-    from rosafe.version import VERSION
+    from rosafe.system.version import VERSION
 
     names = parse_settings(options.outputs)
     values = {p.name: p.default for kind in KINDS.values() for p in kind.parameters if not p.follows_rate}

@@ -17,13 +17,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from rosafe import missing
 from rosafe.commands import _plugins as _child
-from rosafe.component import generate
 from rosafe.declarations import plugins
 from rosafe.declarations.errors import ComponentError
-from rosafe.terminal import printable
-from rosafe.transport import master, paths
+from rosafe.ros1.component import generate
+from rosafe.ros1.transport import master, paths
+from rosafe.system import missing
+from rosafe.system.terminal import printable
 
 OK, NOTE, MISSING = "ok", "note", "MISSING"
 
@@ -186,7 +186,7 @@ def _extras() -> Finding:
 
 
 def _alsaaudio() -> Finding:
-    from rosafe.bass.sources.libasound import load_alsaaudio
+    from rosafe.audio.devices.libasound import load_alsaaudio
 
     paths.prefer_pypi_packages()
     try:
@@ -197,7 +197,7 @@ def _alsaaudio() -> Finding:
 
 
 def _devices() -> Finding:
-    from rosafe.bass.sources.libasound import capture_devices
+    from rosafe.audio.devices.libasound import capture_devices
 
     try:
         devices = capture_devices()

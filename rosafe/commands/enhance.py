@@ -11,10 +11,10 @@ import io
 from pathlib import Path
 from typing import Any
 
-from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._parameters import add_mirror, add_settings, ear_channels, head_of, parameters_of
-from rosafe.output import check_target, write_files
+from rosafe.system import option_types
+from rosafe.system.output import check_target, write_files
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -64,9 +64,9 @@ def run(options: argparse.Namespace) -> int:
     if target.suffix.lower() != ".wav":
         options.usage_error(f"-o: expected a name that ends in .wav, got {target}")
     check_target(target, options.force)
+    from rosafe.audio.files.audiofile import AudioFileError
     from rosafe.localization.enhancement import enhance
-    from rosafe.offline.sounds import read_ears
-    from rosafe.sound.audiofile import AudioFileError
+    from rosafe.processing.sounds import read_ears
 
     try:
         sound, rate = read_ears(inputs[0], options.channels)

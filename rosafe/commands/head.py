@@ -10,10 +10,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._parameters import add_mirror, add_settings, parameters_of
-from rosafe.output import check_target
+from rosafe.system import option_types
+from rosafe.system.output import check_target
 
 _RATE = 44100
 
@@ -56,11 +56,11 @@ def run(options: argparse.Namespace) -> int:
         options.usage_error(f"SOURCE: expected one SOFA file or one list of recordings, got {len(inputs)}")
     target = Path(options.to)
     check_target(target, options.force)
+    from rosafe.audio.files.audiofile import AudioFileError
     from rosafe.localization.head import Head
     from rosafe.localization.model_cache import terminal_progress
     from rosafe.localization.recordings import learn_recordings
     from rosafe.localization.training import learn_head
-    from rosafe.sound.audiofile import AudioFileError
 
     parameters = parameters_of(options.settings) or None
     progress = terminal_progress(inputs[0])

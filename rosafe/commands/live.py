@@ -10,9 +10,9 @@ from __future__ import annotations
 import argparse
 import asyncio
 
-from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._component import prepare
+from rosafe.system import option_types
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -42,15 +42,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
-    from rosafe.component import startup
     from rosafe.interface import ComponentError
-    from rosafe.transport import master
+    from rosafe.ros1.component import startup
+    from rosafe.ros1.transport import master
 
     prepare()
     master.check_family()
     startup.ensure_log_directory()
-    from rosafe.http_server.listener import ListenError
-    from rosafe.live import daemon
+    from rosafe.web.live import daemon
+    from rosafe.web.server.listener import ListenError
 
     try:
         asyncio.run(daemon.serve(options))

@@ -21,12 +21,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._parameters import add_mirror, add_settings, ear_channels, head_of, parameters_of
-from rosafe.missing import require
-from rosafe.output import OutputError, check_target, write_files
-from rosafe.terminal import printable
+from rosafe.system import option_types
+from rosafe.system.missing import require
+from rosafe.system.output import OutputError, check_target, write_files
+from rosafe.system.terminal import printable
 
 _SUFFIXES = (".csv", ".json", ".png")
 _TRACKS = ".tracks.csv"
@@ -136,10 +136,10 @@ def run(options: argparse.Namespace) -> int:
 def _localize(path: str, options: argparse.Namespace) -> int:
     """Localize the sources in a file."""
     files = _files(options)
+    from rosafe.audio.files.audiofile import AudioFileError
     from rosafe.localization.localize import localize
     from rosafe.localization.results import estimates_csv, read_yaw
-    from rosafe.offline.sounds import read_ears
-    from rosafe.sound.audiofile import AudioFileError
+    from rosafe.processing.sounds import read_ears
 
     try:
         yaw: Any = read_yaw(options.yaw) if options.yaw else 0.0
@@ -171,7 +171,7 @@ def _run_node(options: argparse.Namespace) -> int:
     for name in ("yaw", "to", "channels", "force"):
         if getattr(options, name):
             options.usage_error(f"{'-o' if name == 'to' else '--' + name}: expected a sound file as well, got none")
-    from rosafe.component import startup
+    from rosafe.ros1.component import startup
 
     if options.check and options.calibrate_noise is not None:
         options.usage_error("--check: expected without --calibrate-noise, got both")
@@ -184,24 +184,24 @@ def _run_node(options: argparse.Namespace) -> int:
     remappings = startup.remappings_given()[1:]
 
     def build(instance: str) -> startup.RosNode:
-        from rosafe.localizer_node.node import LocalizerNode  # needs the messages
+        from rosafe.ros1.localizer.node import LocalizerNode  # needs the messages
 
         return LocalizerNode(given)
 
-    prepare = functools.partial(importlib.import_module, "rosafe.localizer_node.node")
+    prepare = functools.partial(importlib.import_module, "rosafe.ros1.localizer.node")
     return startup.run_node("rosafe localize", build, options, remappings, prepare)
 
 
 def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
     """Check the ears, or calibrate the noise level, with the settings of the node."""
-    from rosafe.component.startup import become_node
+    from rosafe.ros1.component.startup import become_node
 
     become_node("rosafe_localize")
     import rospy
 
-    from rosafe.localizer_node import ear_check, noise_calibration, noise_measurement
-    from rosafe.localizer_node.frame_listener import FrameListener, NoFramesError
-    from rosafe.localizer_node.settings import read_settings
+    from rosafe.ros1.localizer import ear_check, noise_calibration, noise_measurement
+    from rosafe.ros1.localizer.frame_listener import FrameListener, NoFramesError
+    from rosafe.ros1.localizer.settings import read_settings
 
     def say(text: str) -> None:
         print(text, flush=True)

@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._parameters import (
     add_float_handling,
@@ -27,6 +26,7 @@ from rosafe.commands._parameters import (
 )
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs
+from rosafe.system import option_types
 
 if TYPE_CHECKING:
     import numpy as np
@@ -87,9 +87,9 @@ def run(options: argparse.Namespace) -> int:
         raise CommandError(f"-o: expected a name ending in .png, got {target}")
     from matplotlib.figure import Figure
 
-    from rosafe.offline.formats import FORMATS
-    from rosafe.offline.process import process
-    from rosafe.sound.audiofile import AudioFileError
+    from rosafe.audio.files.audiofile import AudioFileError
+    from rosafe.processing.process import process
+    from rosafe.results.formats import FORMATS
     from rosafe.view.axes import save
     from rosafe.view.plot import BACKGROUNDS, draw
 
@@ -118,7 +118,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _result(path: Path, settings: list[str]) -> Mapping[str, Any]:
-    from rosafe.offline.formats import load
+    from rosafe.results.formats import load
 
     if settings:
         raise ValueError(
@@ -132,8 +132,8 @@ def _result(path: Path, settings: list[str]) -> Mapping[str, Any]:
 
 def _sound(path: Path, clip: bool) -> tuple[np.ndarray, int]:
     """Return the sound, (ears, N) with one or two ears, and its sample rate in Hz."""
-    from rosafe.offline.sounds import BAG, open_sound, read_whole
-    from rosafe.sound.audiofile import AudioFile, AudioFileError
+    from rosafe.audio.files.audiofile import AudioFile, AudioFileError
+    from rosafe.processing.sounds import BAG, open_sound, read_whole
 
     with contextlib.closing(open_sound(path) if path.suffix.lower() == BAG else AudioFile(path, clip)) as file:
         if isinstance(file, AudioFile) and file.channels > 2:

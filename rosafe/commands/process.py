@@ -22,7 +22,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._parameters import (
     add_float_handling,
@@ -39,7 +38,8 @@ from rosafe.declarations.text import bytes_text
 from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE, Parameter
 from rosafe.interface.arguments import check_outputs
 from rosafe.interface.remarks import no_frames, warnings_of
-from rosafe.terminal import printable
+from rosafe.system import option_types
+from rosafe.system.terminal import printable
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
 _MAX_JOBS = 10_000
@@ -222,9 +222,9 @@ def run(options: argparse.Namespace) -> int:
 
 def _compute(plan: _Plan, corpus: _Corpus, options: argparse.Namespace, signals: Interrupts) -> None:
     """Compute all results, in several processes or on the workers of Dask."""
-    from rosafe.offline.corpus import compute
-    from rosafe.output import OutputError
-    from rosafe.sound.audiofile import AudioFileError
+    from rosafe.audio.files.audiofile import AudioFileError
+    from rosafe.processing.corpus import compute
+    from rosafe.system.output import OutputError
 
     if not options.dask:
         importlib.import_module("scipy.signal")  # imported once for all processes that are forked from this one
@@ -246,9 +246,9 @@ class _Plan(NamedTuple):
 
 def _plan(inputs: list[Path], folder: Path | None, file: Path | None, options: argparse.Namespace) -> _Plan:
     """Return the plan, checked as far as possible without reading the files. Raises ValueError."""
-    from rosafe.offline.corpus import Settings, find, output_paths
-    from rosafe.offline.files import OUTPUTS
-    from rosafe.offline.formats import FORMATS, check_format, format_of
+    from rosafe.processing.corpus import Settings, find, output_paths
+    from rosafe.processing.files import OUTPUTS
+    from rosafe.results.formats import FORMATS, check_format, format_of
 
     parameters = parameters_of(options.settings, options.preset)
     outputs = check_outputs(OUTPUTS if options.outputs is None else parse_settings(options.outputs))
@@ -343,7 +343,7 @@ def _create_folder(folder: Path | None) -> Path | None:
     new = folder
     while not os.path.lexists(new.parent):
         new = new.parent
-    from rosafe.offline.corpus import make_folder
+    from rosafe.processing.corpus import make_folder
 
     try:
         make_folder(folder)
@@ -430,8 +430,8 @@ class _Corpus:
         shown = list(self.failed.values())
         listed = False
         if folder is not None:
-            from rosafe.offline.corpus import FAILED, write_failed
-            from rosafe.output import OutputError
+            from rosafe.processing.corpus import FAILED, write_failed
+            from rosafe.system.output import OutputError
 
             try:
                 if folder.is_dir():

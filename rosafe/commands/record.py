@@ -16,18 +16,18 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._workers import Interrupted, Interrupts
 from rosafe.interface import ComponentError
-from rosafe.output import PART, AtomicOutput, OutputError, write_whole
-from rosafe.terminal import printable
+from rosafe.system import option_types
+from rosafe.system.output import PART, AtomicOutput, OutputError, write_whole
+from rosafe.system.terminal import printable
 
 if TYPE_CHECKING:
-    from rosafe.bass.recording.levels import LevelMeter
-    from rosafe.bass.recording.outputs import Output
-    from rosafe.bass.recording.recorder import SoundRecorder
-    from rosafe.bass.sources import SoundSource
+    from rosafe.audio.devices import SoundSource
+    from rosafe.audio.files.levels import LevelMeter
+    from rosafe.ros1.bass.recording.outputs import Output
+    from rosafe.ros1.bass.recording.recorder import SoundRecorder
 
 _TOPIC = "bass/Audio"
 _EARS = ("left", "right")
@@ -134,7 +134,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _list() -> int:
     """Print the devices as ListDevices of bass does. A machine without a sound card is not an error."""
-    from rosafe.bass.sources import device_lines
+    from rosafe.audio.devices import device_lines
 
     try:
         for line in device_lines():
@@ -179,20 +179,20 @@ def _is_input(path: Path, device: str) -> bool:
 def _open_source(options: argparse.Namespace, stopping: threading.Event) -> SoundSource:
     try:
         if options.device is not None:
-            from rosafe.bass.sources import open_source
-            from rosafe.transport.paths import prefer_pypi_packages
+            from rosafe.audio.devices import open_source
+            from rosafe.ros1.transport.paths import prefer_pypi_packages
 
             prefer_pypi_packages()
             return open_source(options.device, options.rate, options.chunk, stopping)
         if options.socket:
-            from rosafe.bass.recording.socket_source import SocketSource
+            from rosafe.ros1.bass.recording.socket_source import SocketSource
 
             host, port = options.socket
             return SocketSource(host, port, options.rate, stopping)
-        from rosafe.bass.recording.topic_source import TopicSource
-        from rosafe.component.generate import GenerationError
-        from rosafe.component.startup import become_node
-        from rosafe.transport.master import MasterError
+        from rosafe.ros1.bass.recording.topic_source import TopicSource
+        from rosafe.ros1.component.generate import GenerationError
+        from rosafe.ros1.component.startup import become_node
+        from rosafe.ros1.transport.master import MasterError
 
         try:
             become_node("rosafe_record")
@@ -204,8 +204,8 @@ def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Soun
 
 
 def _record(path: Path | None, options: argparse.Namespace, stopping: threading.Event) -> int:
-    from rosafe.bass.recording.recorder import SoundRecorder
     from rosafe.commands._meter import Meter
+    from rosafe.ros1.bass.recording.recorder import SoundRecorder
 
     with ExitStack() as stack:
         # The file is created before the source is opened, so that a second recorder of the same file fails at once.
@@ -273,7 +273,7 @@ def _complete(part: AtomicOutput, replace: bool, source: SoundSource, frames: in
 
 def _print_reference(spl: float, levels: LevelMeter) -> None:
     """Print the reference level that fits the louder ear. Raises CommandError if the sound is not suitable."""
-    from rosafe.bass.recording.levels import SILENCE, reference
+    from rosafe.audio.files.levels import SILENCE, reference
 
     if any(levels.clipped):
         raise CommandError("the sound was clipped; reduce the gain of the microphone and calibrate again")
@@ -313,7 +313,7 @@ def _opened(part: AtomicOutput | None, options: argparse.Namespace, source: Soun
 
 
 def _open_output(part: AtomicOutput, options: argparse.Namespace, source: SoundSource) -> Output:
-    from rosafe.bass.recording.outputs import BagWriter, WavFile
+    from rosafe.ros1.bass.recording.outputs import BagWriter, WavFile
 
     descriptor = part.begin()
     if part.target.suffix.lower() == ".wav":

@@ -21,7 +21,7 @@ from rosafe.declarations import ros_names
 from rosafe.declarations.text import did_you_mean, short_repr
 from rosafe.interface import REQUEST, ROSAFE, ComponentError, Representation
 from rosafe.interface.arguments import check_parameter
-from rosafe.terminal import printable
+from rosafe.system.terminal import printable
 from rosafe.tree import tree_planner as request
 
 _SETTINGS = [p for p in REQUEST.parameters if p.name not in ("representation", "connect")]  # separate arguments

@@ -15,15 +15,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._component import component, format_error, prepare
 from rosafe.declarations import ros_names
-from rosafe.input import read_regular
 from rosafe.interface import MAX_SETUP, ROSAFE, ComponentError
-from rosafe.output import write_whole
 from rosafe.setups import LOCALIZER_FILES, Setup, SetupError, read, write
-from rosafe.terminal import printable
+from rosafe.system import option_types
+from rosafe.system.input import read_regular
+from rosafe.system.output import write_whole
+from rosafe.system.terminal import printable
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -119,7 +119,7 @@ async def load(setup: Setup, instance: str, wait: float = 0.0) -> dict[str, Any]
 
     Returns the outputs of `interface.LOAD_SETUP`, and `localizer`: running, set or empty. Raises CommandError.
     """
-    from rosafe.client import localizer, setup_transaction
+    from rosafe.ros1.client import localizer, setup_transaction
 
     async with component(instance, wait) as client:
         try:
@@ -134,7 +134,7 @@ async def load(setup: Setup, instance: str, wait: float = 0.0) -> dict[str, Any]
 
 
 async def _captured(options: argparse.Namespace) -> str:
-    from rosafe.client import localizer, setup_transaction
+    from rosafe.ros1.client import localizer, setup_transaction
 
     async with component(options.instance, options.wait) as client:
         try:

@@ -23,11 +23,11 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.declarations.block_length import DEFAULT_FRAMES_PER_BLOCK, MAX_FRAMES_PER_BLOCK
-from rosafe.output import new_file
-from rosafe.terminal import printable
+from rosafe.system import option_types
+from rosafe.system.output import new_file
+from rosafe.system.terminal import printable
 
 if TYPE_CHECKING:
     from rosafe.tree.trace import Event
@@ -91,10 +91,10 @@ def run(options: argparse.Namespace) -> int:
 
 def _compute(path: Path, seconds: float, block: int) -> list[Event]:
     """Return the events of the default tree for the first `seconds` of a sound file."""
+    from rosafe.audio.files.audiofile import AudioFile, AudioFileError
     from rosafe.interface import CORE_REPRESENTATIONS
     from rosafe.interface.arguments import check_parameters
-    from rosafe.offline.chain import Chain
-    from rosafe.sound.audiofile import AudioFile, AudioFileError
+    from rosafe.processing.chain import Chain
     from rosafe.tree.trace import Tracer
 
     tracer = Tracer()
@@ -123,8 +123,8 @@ def _listen(node: str, seconds: float) -> list[Event]:
     import rospy
     from std_msgs.msg import String
 
-    from rosafe.component.startup import become_node
-    from rosafe.node.trace_port import read
+    from rosafe.ros1.afe.trace_port import read
+    from rosafe.ros1.component.startup import become_node
 
     messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
     become_node("rosafe_trace")

@@ -14,15 +14,15 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from rosafe import option_types
 from rosafe.commands._component import format_error, open_graph
 from rosafe.commands._parameters import add_mirror
 from rosafe.interface import ComponentError
 from rosafe.setups import AcquireSettings, Setup
+from rosafe.system import option_types
 
 if TYPE_CHECKING:
-    from rosafe.client.component_client import ComponentClient
     from rosafe.commands._launcher import Launcher
+    from rosafe.ros1.client.component_client import ComponentClient
 
 POLL_SECONDS = 1.0  # between two queries of the state of all nodes
 
@@ -76,8 +76,8 @@ def run(options: argparse.Namespace) -> int:
     """Start the processes, show their states, and end them."""
     from rosafe.commands._launcher import Launcher, environment
     from rosafe.commands.setup import read_file, without_saved_tree
-    from rosafe.component import generate
-    from rosafe.transport import master
+    from rosafe.ros1.component import generate
+    from rosafe.ros1.transport import master
 
     # Errors in the setup are reported before any process starts.
     setup = without_saved_tree(read_file(options.file), options.keep) if options.file else None
@@ -120,7 +120,7 @@ class _Session:
 
     async def run(self) -> None:
         """Run until a signal is received."""
-        from rosafe.component import startup
+        from rosafe.ros1.component import startup
 
         loop = asyncio.get_running_loop()
         for number in startup.ending_signals():
@@ -166,8 +166,8 @@ class _Session:
                 await asyncio.sleep(POLL_SECONDS)
 
     async def _load(self, afe: ComponentClient | None) -> None:
-        from rosafe.client import setup_transaction
         from rosafe.commands._launcher import ManagedProcess
+        from rosafe.ros1.client import setup_transaction
 
         if self._setup is None:
             return

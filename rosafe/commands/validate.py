@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rosafe.commands import CommandError
-from rosafe.missing import require
-from rosafe.output import check_target
+from rosafe.system.missing import require
+from rosafe.system.output import check_target
 
 if TYPE_CHECKING:
     from rosafe.validation.report import Row
@@ -103,7 +103,7 @@ def _write_figures(options: argparse.Namespace) -> int:
 
 def _write(target: Path, rows: list[Row], disturbed: list[Row]) -> None:
     """Write the page, and a picture for each group of comparisons that has curves."""
-    from rosafe.output import write_whole
+    from rosafe.system.output import write_whole
     from rosafe.validation import figures, report
 
     pictures = {}

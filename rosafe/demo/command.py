@@ -11,9 +11,9 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from rosafe import option_types
-from rosafe.component.startup import Parser
-from rosafe.terminal import printable
+from rosafe.ros1.component.startup import Parser
+from rosafe.system import option_types
+from rosafe.system.terminal import printable
 
 DEFAULT_DEVICE = "scene:"
 DEFAULT_SECONDS = 10.0
@@ -147,13 +147,13 @@ def _without_empty_folders(path: Path, signals: _Signals) -> Iterator[None]:
 
 def _run(options: argparse.Namespace, signals: _Signals, scratch: str) -> int:
     """Run the demonstration and print a failure as one line; `scratch` is a folder for log files and caches."""
-    from rosafe.component.generate import GenerationError
+    from rosafe.audio.files.audiofile import AudioFileError
     from rosafe.demo import scenario
     from rosafe.interface import ComponentError
-    from rosafe.output import OutputError
-    from rosafe.sound.audiofile import AudioFileError
-    from rosafe.transport.paths import writable
-    from rosafe.trust import foreign, user_cache
+    from rosafe.ros1.component.generate import GenerationError
+    from rosafe.ros1.transport.paths import writable
+    from rosafe.system.output import OutputError
+    from rosafe.system.trust import foreign, user_cache
 
     try:
         if not writable(options.out):

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.audio.files.windows import new_frames, split_new_frames
 from rosafe.interface import KINDS, ROSAFE, ros_type
-from rosafe.sound.windows import new_frames, split_new_frames
 from rosafe.view.report import PortRow
 from rosafe.view.representations import Representations
 
@@ -183,7 +183,7 @@ class PortRecorder:
         import rospy
         from diagnostic_msgs.msg import DiagnosticArray
 
-        from rosafe.component import serialization
+        from rosafe.ros1.component import serialization
 
         self.center_frequencies = np.zeros(0)
         self.lags = np.zeros(0)

@@ -17,7 +17,7 @@ from rosafe.demo.recorder import PortRecorder
 from rosafe.demo.session import NAMES, POLL_SECONDS, DemoError, DemoSession, acquire, requests
 from rosafe.demo.sound import DemoSound
 from rosafe.localization import angles
-from rosafe.terminal import printable
+from rosafe.system.terminal import printable
 from rosafe.view import report
 from rosafe.view.representations import Representations
 

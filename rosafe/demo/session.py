@@ -10,11 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rosafe import interface
-from rosafe.component import generate
 from rosafe.demo.processes import Child, ProcessGroup
 from rosafe.demo.sound import DemoSound
-from rosafe.transport.master import PrivateMaster
-from rosafe.transport.paths import CODE_DIR
+from rosafe.ros1.component import generate
+from rosafe.ros1.transport.master import PrivateMaster
+from rosafe.ros1.transport.paths import CODE_DIR
 
 START_SECONDS = 30.0
 REQUEST_SECONDS = 30.0

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rosafe.bass.sources import DEFAULT_RATE, open_source
+from rosafe.audio.devices import DEFAULT_RATE, open_source
+from rosafe.audio.files.audiofile import AudioFile
 from rosafe.declarations.block_length import DEFAULT_FRAMES_PER_BLOCK
 from rosafe.localization.head import Head
 from rosafe.localization.scene import Truth
-from rosafe.sound.audiofile import AudioFile
 
 SOUND_FILES = {".wav", ".flac", ".ogg", ".oga", ".opus", ".mp3", ".aif", ".aiff", ".aifc", ".au", ".caf", ".w64"}
 GUIDE_RATES = (32000, 48000)  # range of sample rates for the block and chunk length of the user guide

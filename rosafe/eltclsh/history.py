@@ -9,8 +9,8 @@ import readline
 from pathlib import Path
 from tkinter import TclError
 
-from rosafe.input import read_regular
-from rosafe.output import OutputError, write_whole
+from rosafe.system.input import read_regular
+from rosafe.system.output import OutputError, write_whole
 
 _HEADER = "_HiStOrY_V2_"  # of libedit, which the original uses; characters except graphic ASCII are written as \ooo
 _MAX_BYTES = 2**22

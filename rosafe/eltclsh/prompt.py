@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from rosafe.eltclsh.interpreter import Interpreter
 from rosafe.eltclsh.signals import Signals
-from rosafe.version import VERSION
+from rosafe.system.version import VERSION
 
 if TYPE_CHECKING:  # scripts do not need readline
     from rosafe.eltclsh.history import LineHistory

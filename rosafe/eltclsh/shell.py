@@ -14,7 +14,7 @@ from rosafe.eltclsh.library import tcl as library
 from rosafe.eltclsh.prompt import Prompt
 from rosafe.eltclsh.signals import Signals
 from rosafe.eltclsh.words import parse
-from rosafe.version import VERSION
+from rosafe.system.version import VERSION
 
 COMPATIBLE_VERSION = "1.20"  # of the original, for `package require eltclsh`
 USAGE = """usage: {name} [-package NAME]... [SCRIPT [ARGUMENT]...]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rosafe.declarations.text import did_you_mean, short_repr
@@ -81,3 +81,13 @@ def check_outputs(outputs: Any) -> list[str]:
     if not requested:
         raise ValueError("outputs: expected at least one name, got none")
     return [kind for kind in KINDS if kind in requested]
+
+
+def needed(outputs: Iterable[str]) -> list[str]:
+    """Return the kinds of processors that `outputs` need, parents first."""
+    found = {kind.kind for kind in KINDS.values() if not kind.parent}
+    for kind in outputs:
+        while kind:
+            found.add(kind)
+            kind = KINDS[kind].parent
+    return [kind for kind in KINDS if kind in found]

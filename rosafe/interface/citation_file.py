@@ -9,7 +9,7 @@ import yaml
 
 from rosafe.declarations.reference import Reference
 from rosafe.interface.citing import TITLE, software
-from rosafe.version import VERSION
+from rosafe.system.version import VERSION
 
 _TYPES = {
     "article": "article",

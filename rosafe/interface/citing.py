@@ -10,7 +10,7 @@ from rosafe.declarations.literature import TWOEARS_2018
 from rosafe.declarations.parameter import format_value
 from rosafe.declarations.reference import Citation, Reference, applicable
 from rosafe.declarations.representation import Representation
-from rosafe.version import AUTHORS, VERSION
+from rosafe.system.version import AUTHORS, VERSION
 
 _WIDTH = 100  # characters of a line
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.numeric_limits import FloatArray, as_numbers
 from rosafe.interface.arguments import check_parameters
-from rosafe.offline.stream import Stream
+from rosafe.processing.stream import Stream
 from rosafe.representations import STAGES
 
 KINDS = ("itd", "ild", "ic", "ratemap")  # the representations that localization needs

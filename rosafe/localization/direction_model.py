@@ -36,10 +36,10 @@ from rosafe.localization.cues import (
     level_class,
 )
 from rosafe.localization.sofa import MAX_RATE, MIN_RATE
-from rosafe.offline.readers import open_npz
-from rosafe.offline.result_metadata import MAX_TEXT, from_json
-from rosafe.output import new_file
-from rosafe.terminal import printable
+from rosafe.results.readers import open_npz
+from rosafe.results.result_metadata import MAX_TEXT, from_json
+from rosafe.system.output import new_file
+from rosafe.system.terminal import printable
 
 FORMAT = "rosafe direction model 1"
 WINDOW = 100  # frames for which a floor is estimated while learning

@@ -21,9 +21,9 @@ from rosafe.localization import angles, cues
 from rosafe.localization.direction_model import WINDOW, DirectionModel
 from rosafe.localization.head import Head
 from rosafe.localization.localizer import Localizer
-from rosafe.offline.process import process
-from rosafe.offline.resynthesis import resynthesize
-from rosafe.offline.signals import ears_view
+from rosafe.processing.process import process
+from rosafe.processing.resynthesis import resynthesize
+from rosafe.processing.signals import ears_view
 
 WIDTH, GAP = 10.0, 10.0  # degrees: directions up to WIDTH from the target are wanted, those beyond WIDTH + GAP are not
 SHARPNESS = 1.5  # factor of log-likelihood ratios

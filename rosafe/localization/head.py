@@ -20,7 +20,7 @@ from rosafe.localization import angles
 from rosafe.localization.filters import HOP, HeadFilters, SourceRenderer
 from rosafe.localization.sofa import MAX_NUMBERS, MAX_RATE, MIN_RATE, read_sofa
 from rosafe.localization.sphere import sphere_filters
-from rosafe.terminal import printable
+from rosafe.system.terminal import printable
 
 _SYMMETRY = 1e-6  # of the energy; below, two ears count as mirrored
 _CUE_RATE = 48000.0  # Hz, at which the cues of the sphere are computed

@@ -11,7 +11,7 @@ import numpy as np
 
 from rosafe.localization.head import Head
 from rosafe.localization.localizer import Localizer
-from rosafe.offline.signals import ears_view
+from rosafe.processing.signals import ears_view
 
 _BLOCK_SECONDS = 10.0
 _FULL_SCALE = 1 - 2.0**-15  # from here on a sample may be clipped

@@ -23,8 +23,8 @@ from rosafe.localization.noise import SteadyNoise
 from rosafe.localization.posterior import Estimate, Estimator
 from rosafe.localization.tracker import MIN_LEVEL_DB, Track, Tracker
 from rosafe.localization.training import Progress
-from rosafe.offline.signals import ears_view
-from rosafe.offline.stream import Stream
+from rosafe.processing.signals import ears_view
+from rosafe.processing.stream import Stream
 
 MAX_SECONDS = 60.0
 MAX_UNITS = 2**21  # frames of channels in a window

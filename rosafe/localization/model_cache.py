@@ -17,8 +17,8 @@ from rosafe.localization import cues
 from rosafe.localization.direction_model import FORMAT, DirectionModel
 from rosafe.localization.head import Head
 from rosafe.localization.training import Progress, learn_head
-from rosafe.output import OutputError
-from rosafe.trust import foreign, user_cache
+from rosafe.system.output import OutputError
+from rosafe.system.trust import foreign, user_cache
 
 VERSION = 4  # of the method; another one makes models on disk obsolete
 _models: weakref.WeakKeyDictionary[Head, dict[str, DirectionModel]] = weakref.WeakKeyDictionary()

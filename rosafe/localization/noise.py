@@ -22,12 +22,12 @@ import numpy as np
 
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.numeric_limits import FloatArray
-from rosafe.input import open_regular
 from rosafe.localization import angles
 from rosafe.localization.mixture import MIN_SALIENCE, Candidate
 from rosafe.localization.tracker import GATE, Tracker
-from rosafe.output import write_whole
-from rosafe.terminal import printable
+from rosafe.system.input import open_regular
+from rosafe.system.output import write_whole
+from rosafe.system.terminal import printable
 
 MEMORY = 20  # levels of 0.1 s, of which the minimum is the noise level
 MARGIN_DB = 8.0  # of a frame above the minimum: the level of 20 ms of noise varies by some dB

@@ -17,9 +17,9 @@ from rosafe.localization.head import checked_rate
 from rosafe.localization.horizontal_plane import MAX_GAP
 from rosafe.localization.results import read_recordings
 from rosafe.localization.training import Progress
-from rosafe.offline.memory import refuse_over_available
-from rosafe.offline.sounds import open_sound
-from rosafe.terminal import printable
+from rosafe.processing.sounds import open_sound
+from rosafe.results.memory import refuse_over_available
+from rosafe.system.terminal import printable
 
 MAX_SECONDS = 60.0  # of sound that is used for a direction
 MAX_FRAMES = 2**22  # of a direction

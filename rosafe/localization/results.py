@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from rosafe.declarations.text import short_repr
-from rosafe.input import open_regular
 from rosafe.localization import angles
-from rosafe.terminal import printable
+from rosafe.system.input import open_regular
+from rosafe.system.terminal import printable
 
 MAX_TABLE = 1 << 26  # bytes
 MAX_LINES = 2_000_000

@@ -8,8 +8,8 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+from rosafe.audio.files.audiofile import AudioFileError
 from rosafe.declarations.text import short_repr
-from rosafe.input import read_regular
 from rosafe.localization.head import Head
 from rosafe.localization.scene import Course, SceneDescription, SourceDescription
 from rosafe.localization.scene_signals import (
@@ -21,8 +21,8 @@ from rosafe.localization.scene_signals import (
     VowelSignal,
 )
 from rosafe.setups.markup import SetupError, YamlNode, parse
-from rosafe.sound.audiofile import AudioFileError
-from rosafe.terminal import printable
+from rosafe.system.input import read_regular
+from rosafe.system.terminal import printable
 
 SUFFIXES = (".yaml", ".yml")
 MAX_BYTES = 1 << 18

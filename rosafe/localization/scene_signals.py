@@ -11,8 +11,8 @@ from typing import Protocol
 import numpy as np
 import scipy.signal
 
+from rosafe.audio.files.audiofile import AudioFile, AudioFileError
 from rosafe.dsp.numeric_limits import FloatArray
-from rosafe.sound.audiofile import AudioFile, AudioFileError
 
 ENDLESS = 2**62  # frames
 MAX_FILE_FRAMES = 2**25  # of one sound file

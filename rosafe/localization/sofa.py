@@ -22,8 +22,8 @@ from rosafe.localization.horizontal_plane import (
     choose_directions,
     near_ear_gain,
 )
-from rosafe.offline.containers import open_hdf5
-from rosafe.terminal import printable
+from rosafe.results.containers import open_hdf5
+from rosafe.system.terminal import printable
 
 CONVENTION = "SimpleFreeFieldHRIR"
 MAX_RESPONSES = 100_000

@@ -18,7 +18,7 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles, cues
 from rosafe.localization.direction_model import DirectionModel, Histograms
 from rosafe.localization.head import Head
-from rosafe.offline.process import process
+from rosafe.processing.process import process
 
 SNR_DB = (30.0, 20.0, 12.0, 6.0, 2.0, -2.0, -6.0)
 # Noise without modulation, whose level is near its floor although nothing disturbs it: a small part of the sounds, as

@@ -1,7 +1,7 @@
 """Setups: text files that describe a tree of processors with its sound (docs/setups.md). Does not use ROS.
 
 `read` and `write` convert between text and `Setup`; `plan` determines the requests that load a setup into an existing
-tree. rosafe/client/setup_transaction.py sends these requests to a running graph.
+tree. rosafe/ros1/client/setup_transaction.py sends these requests to a running graph.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rosafe.output import write_whole
+from rosafe.system.output import write_whole
 from rosafe.validation import published
 from rosafe.validation.binaural import lateral_itd
 from rosafe.validation.comparison import Process
@@ -31,7 +31,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
     Raises
     ------
-    rosafe.output.OutputError
+    rosafe.system.output.OutputError
         The file cannot be written.
     """
     _draw([row for row in rows if row.curve is not None], _panel, path)
@@ -190,7 +190,7 @@ def write_published(folder: Path, process: Process) -> list[Path]:
 
     Raises
     ------
-    rosafe.output.OutputError
+    rosafe.system.output.OutputError
         A file cannot be written.
     """
     figures = published_figures(process)

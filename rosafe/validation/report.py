@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from rosafe.dsp.numeric_limits import FloatArray
-from rosafe.offline.process import process
-from rosafe.offline.result import Result
+from rosafe.processing.process import process
+from rosafe.results.result import Result
+from rosafe.system.version import VERSION
 from rosafe.validation import binaural, kemar, monaural, peers, periphery, systems, transients
 from rosafe.validation.comparison import (
     DEFINITION,
@@ -23,7 +24,6 @@ from rosafe.validation.comparison import (
     Measured,
     Process,
 )
-from rosafe.version import VERSION
 
 
 def comparisons(short: bool = False) -> list[Comparison]:

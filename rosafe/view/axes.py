@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rosafe.missing import require
-from rosafe.output import new_file
+from rosafe.system.missing import require
+from rosafe.system.output import new_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,7 @@ import pytest
 import soundfile
 
 from rosafe.localization import model_cache
-from tests.bass.pulseaudio import PulseServer
+from tests.audio.pulseaudio import PulseServer
 from tests.demo.conftest import SCENE_RATE, Learn
 from tests.demo.running import DEMO_SECONDS, PORTS, Demo, path, table
 

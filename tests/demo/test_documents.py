@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from rosafe.component.audio import RING_SECONDS, Counters
+from rosafe.ros1.component.audio import RING_SECONDS, Counters
 from tests.harness import ROOT
 
 DOCS = ROOT / "docs"

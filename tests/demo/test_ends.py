@@ -117,7 +117,7 @@ def test_help_installs_nothing(tmp_path: Path) -> None:
     for script, argument, example in (
         ("demo", "-h", "scripts/demo speech.wav"),
         ("demo", "--help", "scripts/demo speech.wav"),
-        ("test", "--help", "scripts/test tests/genomix -k"),
+        ("test", "--help", "scripts/test tests/web/genomix -k"),
     ):
         copy = checkout_with_install(tmp_path / script / argument, "echo installing; exit 1", script)
         done = subprocess.run([copy, argument], check=True, capture_output=True, text=True)

@@ -15,11 +15,11 @@ import soundfile
 import rosafe
 from rosafe import interface
 from rosafe.localization import training
-from rosafe.transport.master import is_local
+from rosafe.ros1.transport.master import is_local
 from tests.demo.conftest import SCENE_RATE, Learn
 from tests.demo.running import check_picture, check_walk, marked_processes, new_mark
-from tests.genomix import world as worlds
 from tests.harness import PYTHON, ROOT, SCRIPTS, Process, free_port, wait_for
+from tests.web.genomix import world as worlds
 
 RATE = 16000
 README = (ROOT / "README.md").read_text("utf-8")

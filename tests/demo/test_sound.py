@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import soundfile
 
+from rosafe.audio.files.audiofile import AudioFileError
 from rosafe.demo import session
 from rosafe.demo.sound import DemoSound, choose
 from rosafe.interface import ComponentError
-from rosafe.sound.audiofile import AudioFileError
 
 
 def wav(path: Path, sample_rate: int = 16000, seconds: float = 3.0, channels: int = 2) -> Path:

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from tests import harness
-from tests.genomix import world as worlds
-from tests.genomix.test_guide import guide_commands
 from tests.terminal import Terminal
+from tests.web.genomix import world as worlds
+from tests.web.genomix.test_guide import guide_commands
 
 pytestmark = pytest.mark.ros
 

@@ -13,7 +13,7 @@ from rosafe.declarations.literature import DAU_1996, LITERATURE, YOUNG_2006
 from rosafe.declarations.reference import Citation, Reference
 from rosafe.interface import KINDS, citation_file, citing
 from rosafe.representations import BUILTIN
-from rosafe.version import AUTHORS, VERSION
+from rosafe.system.version import AUTHORS, VERSION
 from tests.harness import ROOT
 
 DEFAULTS = {p.name: p.default for kind in KINDS.values() for p in kind.parameters}

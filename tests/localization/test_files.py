@@ -21,15 +21,15 @@ import numpy as np
 import pytest
 
 import rosafe
-from rosafe import trust
 from rosafe.localization import angles, cues, model_cache, results
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.noise import NoiseCalibration
-from rosafe.localizer_node import noise_calibration
-from rosafe.offline import isolated
+from rosafe.results import isolated
+from rosafe.ros1.localizer import noise_calibration
+from rosafe.system import trust
 from tests.harness import PYTHON, ROOT
 from tests.localization.test_head import write_sofa
-from tests.offline.damage import change, forked
+from tests.results.damage import change, forked
 
 MEMORY = 600  # MiB, of which the libraries take 100
 PARAMETERS = {"fb_cfHz": None, "fb_nChannels": 3}

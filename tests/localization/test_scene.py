@@ -10,8 +10,8 @@ import pytest
 import soundfile
 
 import rosafe
-from rosafe.bass.sources import open_source
-from rosafe.bass.sources.scene_file import SceneFileSource
+from rosafe.audio.devices import open_source
+from rosafe.audio.devices.scene_file import SceneFileSource
 from rosafe.interface import ComponentError
 from rosafe.localization.results import read_yaw
 from rosafe.localization.scene import Course, SceneRenderer, truth_csv

@@ -16,7 +16,7 @@ from rosafe.commands.__main__ import main
 from rosafe.localization import angles, training
 from rosafe.localization.horizontal_plane import near_ear_gain
 from rosafe.localization.sofa import read_sofa
-from rosafe.localizer_node import settings as node_settings
+from rosafe.ros1.localizer import settings as node_settings
 from tests.harness import shared
 
 h5py = pytest.importorskip("h5py")

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.genomix import world as worlds
 from tests.matlab import octave
+from tests.web.genomix import world as worlds
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.genomix.world import World
+from tests.web.genomix.world import World
 
 COMMAND = ("octave-cli", "--norc", "--quiet", "--no-history")
 SHOW = """\

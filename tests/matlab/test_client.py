@@ -10,9 +10,9 @@ import pytest
 
 from rosafe.interface import BASS
 from tests import harness
-from tests.genomix.world import World
 from tests.matlab import octave
 from tests.terminal import Terminal
+from tests.web.genomix.world import World
 
 pytestmark = pytest.mark.ros
 

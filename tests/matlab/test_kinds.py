@@ -14,9 +14,9 @@ import pytest
 
 from rosafe.interface import KINDS
 from tests import harness
-from tests.genomix import world as worlds
-from tests.genomix.world import World
 from tests.matlab import octave
+from tests.web.genomix import world as worlds
+from tests.web.genomix.world import World
 
 pytestmark = pytest.mark.ros
 

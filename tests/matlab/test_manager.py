@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.genomix.world import World
 from tests.matlab import octave
+from tests.web.genomix.world import World
 
 pytestmark = pytest.mark.ros
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.genomix.world import World
 from tests.matlab import octave
+from tests.web.genomix.world import World
 
 pytestmark = pytest.mark.ros
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests import harness
-from tests.genomix import world as worlds
 from tests.matlab import octave
+from tests.web.genomix import world as worlds
 
 pytestmark = pytest.mark.ros
 

@@ -90,4 +90,4 @@ def without_rights(*command: str | Path) -> list[str | Path]:
 
 def generate(copy: Path, *arguments: str) -> list[str | Path]:
     """Return the command that generates the messages of a copy."""
-    return ["env", f"PYTHONPATH={copy}", PYTHON, "-m", "rosafe.component.generate", *arguments]
+    return ["env", f"PYTHONPATH={copy}", PYTHON, "-m", "rosafe.ros1.component.generate", *arguments]

@@ -7,7 +7,7 @@ import re
 from operator import attrgetter
 
 import rosafe
-from rosafe.version import VERSION
+from rosafe.system.version import VERSION
 from tests.harness import ROOT
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from rosafe import __version__
-from rosafe.component import generate
+from rosafe.ros1.component import generate
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, wait_for
 from tests.packaging.clone import definitions, environment, fresh_copy, keep_few_definitions, run
 
@@ -110,7 +110,7 @@ def test_messages_equal_those_of_our_generator(workspace: Path, package: str) ->
 
 
 def test_python(workspace: Path) -> None:
-    code = "import rosafe, rosafe.offline, rosAFE.msg, bass.srv; print(rosafe.__file__, rosAFE.msg.__file__)"
+    code = "import rosafe, rosafe.processing, rosAFE.msg, bass.srv; print(rosafe.__file__, rosAFE.msg.__file__)"
     found = printed(sourced(workspace, f"{PYTHON} -c '{code}'")).split()
     packages = workspace / "install" / "lib" / "python3" / "dist-packages"
     assert found == [str(packages / "rosafe/__init__.py"), str(packages / "rosAFE/msg/__init__.py")]
@@ -157,7 +157,7 @@ def test_python_client(workspace: Path) -> None:
 def test_environment_for_children(workspace: Path) -> None:
     install = workspace / "install"
     python = install / "lib" / "python3" / "dist-packages"
-    command = [PYTHON, "-m", "rosafe.component.generate", "--shell"]
+    command = [PYTHON, "-m", "rosafe.ros1.component.generate", "--shell"]
     exports = dict(
         line.removeprefix("export ").split("=", 1)
         for line in printed(run(*command, env=environment(PYTHONPATH=str(python)), cwd=Path("/"))).splitlines()

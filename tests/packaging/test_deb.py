@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from rosafe.component import generate
-from rosafe.version import VERSION
+from rosafe.ros1.component import generate
+from rosafe.system.version import VERSION
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, wait_for
 from tests.packaging.clone import environment, fresh_copy, run
 
@@ -164,7 +164,7 @@ def test_nodes_run_from_the_packages(root: Path, private_graph: tuple[Graph, Mas
         for name, node in (("bass", bass), ("rosAFE", rosafe)):
             wait_for(lambda name=name: f"/{name}/Stop" in graph.services(), what=lambda node=node: str(node))  # type: ignore[misc]
         exports = run(
-            *(PYTHON, "-P", "-m", "rosafe.component.generate", "--shell"),
+            *(PYTHON, "-P", "-m", "rosafe.ros1.component.generate", "--shell"),
             env=environment(PYTHONPATH=str(root / "usr/lib/python3/dist-packages"), **ros),
         ).stdout
         request = "rosservice call /bass/Acquire \"{device: 'scene:'}\" && rosafe request ild"

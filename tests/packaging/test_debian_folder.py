@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from rosafe import missing
+from rosafe.system import missing
 from tests import fork_server, harness
 from tests.harness import PYTHON, ROOT
 from tests.packaging.clone import environment, run

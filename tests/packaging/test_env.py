@@ -84,7 +84,7 @@ def test_second_call_has_no_effect(copy: Path, shell: str) -> None:
         ("", ". scripts/env.sh"),
         ("", ". ./scripts/env.sh"),
         ("scripts", ". ./env.sh"),
-        ("rosafe/node", ". ../../scripts/env.sh"),
+        ("rosafe/ros1/afe", ". ../../../scripts/env.sh"),
         ("", "(. scripts/env.sh && {show})"),  # in a subshell
         ("", "set -eu; . scripts/env.sh"),
     ],
@@ -163,7 +163,7 @@ def test_dash_without_proc(copy: Path) -> None:
     probe = hidden("true", Path("/"))
     if probe.returncode != 0:
         pytest.skip(f"no mount namespace here: {probe.stderr}")
-    for folder in (copy, copy / "rosafe" / "node"):
+    for folder in (copy, copy / "rosafe" / "ros1" / "afe"):
         assert variables(hidden(f"{source(copy)}; {SHOW}", folder))["PATH"].startswith(f"{copy}/scripts:")
     done = hidden(f"{source(copy)}; echo $?", Path("/"))
     assert done.stdout == "1\n"

@@ -15,7 +15,7 @@ from tests.harness import PATIENCE, PYTHON, ROOT, Graph, run_together
 from tests.packaging.clone import environment, fresh_copy, generate, keep_few_definitions, run, without_rights
 
 IMPORT = (
-    "from rosafe.component import generate; generate.ensure_messages(); "
+    "from rosafe.ros1.component import generate; generate.ensure_messages(); "
     "import rosAFE.msg, rosAFE.srv, bass.msg, bass.srv; "
     "print(rosAFE.msg.__file__, rosAFE.msg.InputProcAction._md5sum, bass.srv.Acquire._md5sum)"
 )
@@ -247,6 +247,6 @@ def test_rosrun_finds_the_executables(graph: Graph) -> None:
 def test_quick_if_up_to_date(copy: Path) -> None:
     """genpy is not imported: its import alone would take longer than the rest."""
     assert run(*generate(copy), env=environment()).returncode == 0
-    ensure = "from rosafe.component import generate; generate.ensure_messages()"
+    ensure = "from rosafe.ros1.component import generate; generate.ensure_messages()"
     code = f"import sys; {ensure}; print('genpy' in sys.modules)"
     assert run(PYTHON, "-c", code, env=environment(PYTHONPATH=str(copy))).stdout == "False\n"

@@ -21,7 +21,7 @@ from pathlib import Path
 import pytest
 
 from rosafe.dsp.kernels import build
-from rosafe.version import VERSION
+from rosafe.system.version import VERSION
 from tests.harness import PYTHON, ROOT
 from tests.packaging.clone import environment, fresh_copy, run
 
@@ -127,14 +127,15 @@ def test_library_tests_in_the_environment(venv: Venv, tmp_path: Path) -> None:
     (tmp_path / "tests").mkdir()
     modules = ("__init__.py", "harness.py", "fork_server.py")
     for source in (
-        ROOT / "tests" / name for name in (*modules, "offline", "dsp", "representations", "tree", "vectors")
+        ROOT / "tests" / name
+        for name in (*modules, "processing", "results", "dsp", "representations", "tree", "vectors")
     ):
         copy = shutil.copytree if source.is_dir() else shutil.copy
         copy(source, tmp_path / "tests" / source.name)
     (tmp_path / "pytest.ini").write_text(
         "[pytest]\naddopts = --import-mode=importlib -p no:cacheprovider\npythonpath=.\n"
     )
-    tests = ["tests/offline/test_arguments.py", "tests/vectors"]
+    tests = ["tests/processing/test_arguments.py", "tests/vectors"]
     done = venv.run("python", "-m", "pytest", "-q", *tests, cwd=tmp_path)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr
     assert " passed" in done.stdout

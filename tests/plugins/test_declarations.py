@@ -274,7 +274,7 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
         (folder / f"case{number}.py").write_text(GOOD.replace(case.old, case.new).format(kind=f"kind{number}"))
     code = """
 import json, numpy, rosafe, rosafe.interface
-from rosafe.component import generate
+from rosafe.ros1.component import generate
 from rosafe.representations import BUILTIN, PROBLEMS, STAGES
 result = rosafe.process(numpy.zeros((2, 100)), 16000, outputs=["good"])
 assert result["good"].shape[-1] == 100

@@ -12,12 +12,12 @@ from unittest import mock
 
 import pytest
 
-from tests.genomix import world as worlds
 from tests.harness import ROOT, wait_for
-from tests.live.world import live, page
 from tests.plugins.stages import FRAMED, PLAIN, SAMPLES, Fault, text_of
 from tests.plugins.support import python
 from tests.plugins.test_documents import plugins
+from tests.web.genomix import world as worlds
+from tests.web.live.world import live, page
 
 OF_THE_PAGE = ("zeroCrossings", "bands", "slowRatemap")
 WITH_HOOKS = ("everyNth", "meanSquare", "fineIld")

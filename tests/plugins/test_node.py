@@ -13,10 +13,10 @@ import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from rosafe.live.health import Health
-from tests.genomix import world as worlds
+from rosafe.web.live.health import Health
 from tests.harness import wait_for
 from tests.plugins.stages import DERIVED, PLAIN, Fault, process, text_of
+from tests.web.genomix import world as worlds
 
 pytestmark = pytest.mark.ros
 

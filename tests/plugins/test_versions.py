@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from rosafe.setups import read
-from tests.genomix.world import Http, HttpError, port_of
 from tests.harness import SCRIPTS, Graph, wait_for
+from tests.web.genomix.world import Http, HttpError, port_of
 
 from .test_declarations import GOOD
 

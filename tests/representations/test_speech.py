@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.sound.audiofile import AudioFile
+from rosafe.audio.files.audiofile import AudioFile
 from tests import harness
 
 from .chain import FloatArray, process

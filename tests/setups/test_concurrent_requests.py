@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from rosafe.client import setup_transaction
 from rosafe.interface import ComponentError
+from rosafe.ros1.client import setup_transaction
 from rosafe.tree import tree_builder
 from tests.setups.test_loading import Graph
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from rosafe.client import setup_transaction
 from rosafe.interface import BASS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
+from rosafe.ros1.client import setup_transaction
 from rosafe.setups import dry_run, read, write
-from tests.request.model import Model, Processor
+from tests.ros1.client.model import Model, Processor
 
 SETUP = """
 sound: {device: "scene:", nFramesPerChunk: 441}

@@ -16,14 +16,14 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from rosafe.bass.socket_client import SocketClient
-from rosafe.component import serialization
-from tests.genomix.world import HttpError
+from rosafe.ros1.bass.socket_client import SocketClient
+from rosafe.ros1.component import serialization
 from tests.harness import run_together, wait_for
-from tests.ros.session import reader
+from tests.ros1.afe.session import reader
 from tests.soak import peers
 from tests.soak.peers import Address, crowd, flood, node_addresses
 from tests.soak.world import PEAK_MEMORY, World, following, later, recorded
+from tests.web.genomix.world import HttpError
 
 NODES = ("rosAFE", "bass")
 TOO_MUCH = 3 * PEAK_MEMORY  # bytes, which the receiver should not accept

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import rospy
 
-from rosafe.component import serialization
+from rosafe.ros1.component import serialization
 from tests.harness import freeze, run_together, wait_for
-from tests.ros.session import error_of, reader
+from tests.ros1.afe.session import error_of, reader
 from tests.soak.world import NAMES, World, following, wait_out
 
 CHANGES = [

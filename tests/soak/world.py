@@ -17,16 +17,16 @@ import numpy as np
 import rospy
 import soundfile
 
-from rosafe.component import serialization, state_publisher
 from rosafe.interface import BASS, CORE_REPRESENTATIONS, ROSAFE
 from rosafe.interface.arguments import check_parameters
-from rosafe.offline.chain import Chain
-from rosafe.transport import registration
+from rosafe.processing.chain import Chain
+from rosafe.ros1.component import serialization, state_publisher
+from rosafe.ros1.transport import registration
 from rosafe.tree.sliding_window import SlidingWindow, frames_in
 from tests import harness
-from tests.genomix.world import Http, genomixd
 from tests.harness import free_port, freeze, proc, run_together, wait_for
-from tests.ros.session import Session, assert_holds
+from tests.ros1.afe.session import Session, assert_holds
+from tests.web.genomix.world import Http, genomixd
 
 NAMES = {kind: ROSAFE.service(entry.request).parameter("name").default for kind, entry in CORE_REPRESENTATIONS.items()}
 TREE = {kind: [name] for kind, name in NAMES.items()}

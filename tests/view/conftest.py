@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rosafe
-from rosafe.bass.sources.scene import Scene
+from rosafe.audio.devices.scene import Scene
 from rosafe.view.representations import Representations
 
 OUTPUTS = ("gammatone", "ild", "ratemap", "crossCorrelation")

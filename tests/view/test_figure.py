@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import rosafe
-from rosafe.output import OutputError
+from rosafe.system.output import OutputError
 from rosafe.view import figure
 from rosafe.view.axes import save
 from rosafe.view.representations import Representations

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import rosafe
-from rosafe.bass.sources.scene import Scene
+from rosafe.audio.devices.scene import Scene
 from rosafe.interface import KINDS, Representation
 from rosafe.view import plot as module
 from rosafe.view.plot import draw, plot

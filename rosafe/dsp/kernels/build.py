@@ -21,8 +21,8 @@ from pathlib import Path
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
-from rosafe.output import lock_file
-from rosafe.trust import foreign
+from rosafe.system.output import lock_file
+from rosafe.system.trust import foreign
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]

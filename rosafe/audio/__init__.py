@@ -1,0 +1,1 @@
+"""Sound: devices, scenes and sound files, without ROS."""

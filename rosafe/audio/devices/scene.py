@@ -1,0 +1,146 @@
+"""The source `scene:`: a built-in binaural scene, a talker that moves from far left to far right and back.
+
+The head is the rigid sphere of rosafe/localization/sphere.py.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+
+import numpy as np
+from scipy import signal
+
+from rosafe.audio.devices.base import PacedSource, device_error, hwparams_error, parse_options
+from rosafe.audio.files.audiofile import to_int32
+from rosafe.localization.filters import HOP, SourceRenderer
+from rosafe.localization.scene import BLOCK, Truth
+from rosafe.localization.sphere import sphere_filters
+from rosafe.system.option_types import number, seconds, whole_number
+
+WALK_SECONDS = 10.0
+LEVEL_DB = -30.0
+MIN_RATE = 1000  # Hz; almost no sound would remain below
+_PITCH = (125.0, 25.0, 0.37)  # Hz: mean, excursion and speed of the talker's gliding voice
+_SYLLABLE = 0.25  # s
+
+
+class Scene:
+    """The samples of the scene, in order. They depend only on options and sample rate, not on the block length.
+
+    Parameters
+    ----------
+    sample_rate : int
+        Hz.
+    seconds : float
+        Length of one walk.
+    level : float
+        RMS level of the source, before the head, in dB below full scale.
+    seed : int
+        Seed of the noise.
+    """
+
+    def __init__(self, sample_rate: int, seconds: float = WALK_SECONDS, level: float = LEVEL_DB, seed: int = 0) -> None:
+        self.sample_rate = sample_rate
+        self.seconds = seconds
+        self._carrier = _Carrier(sample_rate, seed)
+        first_second = _Carrier(sample_rate, seed).block(np.arange(sample_rate) / sample_rate)
+        self._gain = 10 ** (level / 20) / np.sqrt(np.mean(first_second**2))
+        self._renderer = SourceRenderer(sphere_filters(sample_rate))
+        self._frame = 0  # number of the first frame of the next block
+        self._block = np.zeros((2, 0), np.int32)
+
+    def azimuth(self, times: np.ndarray | float) -> np.ndarray:
+        """Return the azimuth of the talker at `times` (s from the first frame): degrees, left positive."""
+        phase = np.mod(np.asarray(times, dtype=np.float64) / self.seconds, 2.0)
+        return np.asarray(180.0 * np.abs(phase - 1.0) - 90.0)
+
+    def frames(self, count: int) -> np.ndarray:
+        """Return the next `count` frames: int32, (2, count)."""
+        parts = [self._block[:, :count]]
+        self._block = self._block[:, count:]
+        missing = count - parts[0].shape[1]
+        while missing > 0:
+            block = self._next_block()
+            parts.append(block[:, :missing])
+            self._block = block[:, missing:]
+            missing -= parts[-1].shape[1]
+        return np.concatenate(parts, axis=1)
+
+    def _next_block(self) -> np.ndarray:
+        times = (self._frame + np.arange(BLOCK + 1)) / self.sample_rate
+        self._frame += BLOCK
+        source = self._gain * self._carrier.block(times[:-1])
+        return to_int32(self._renderer.process(source, self.azimuth(times[::HOP])))
+
+
+class SceneSource(PacedSource):
+    """The scene in real time.
+
+    Parameters
+    ----------
+    text : str
+        Options, after an optional question mark: ``seconds`` of one walk (default 10), ``level`` in dB below full
+        scale (default -30), ``seed`` of the noise (default 0).
+    """
+
+    frames = None  # it has no end
+
+    def __init__(self, text: str, sample_rate: int, frames_per_chunk: int, stopping: threading.Event) -> None:
+        super().__init__(f"scene:{text}", stopping)
+        if text and not text.startswith("?"):
+            raise device_error(f"{self.name}: expected options after a question mark, such as scene:?seconds=5")
+        options = parse_options(self.name, text[1:], _OPTIONS)
+        if sample_rate < MIN_RATE:
+            raise hwparams_error(f"{self.name}: expected a sample rate of at least {MIN_RATE} Hz, got {sample_rate}")
+        self._scene = scene = Scene(sample_rate, **options)
+        self._start(sample_rate, frames_per_chunk, ((0, scene.frames(frames_per_chunk)) for _ in itertools.count()))
+
+    def truth(self, time: float) -> Truth:
+        """Return the true direction at a time in s from the first frame, left positive."""
+        return Truth(0.0, ("talker",), (float(self._scene.azimuth(time)),))
+
+
+_OPTIONS = {
+    "seconds": seconds(0.1, 86400),
+    "level": number(-120, 0, "a number"),
+    "seed": whole_number(0, 10**18 - 1),
+}
+
+
+class _Carrier:
+    """The signal of the source, (block,) of float64: voiced syllables and bursts of noise.
+
+    Its bandwidth is a fifth of the sample rate, and at most 8 kHz.
+    """
+
+    def __init__(self, sample_rate: int, seed: int) -> None:
+        top = min(8000.0, sample_rate / 5)
+        self._harmonics = max(1, int(top / (_PITCH[0] + _PITCH[1])))
+        self._random = np.random.PCG64(seed)
+        self._tilt = signal.butter(1, min(700.0, sample_rate / 10), fs=sample_rate)
+        self._tilt_state = np.zeros(1)
+        self._band = signal.butter(4, top, fs=sample_rate, output="sos")
+        self._band_state = np.zeros((self._band.shape[0], 2))
+
+    def block(self, times: np.ndarray) -> np.ndarray:
+        """Return the samples at `times` (s), which must follow those of the previous call."""
+        within = np.mod(times, _SYLLABLE) / _SYLLABLE
+        voiced, self._tilt_state = signal.lfilter(*self._tilt, self._voice(times), zi=self._tilt_state)
+        # random_raw is the same in all versions of numpy; distributions may differ.
+        uniform = (self._random.random_raw(len(times)) >> np.uint64(11)) * 2.0**-52 - 1.0
+        noise, self._band_state = signal.sosfilt(self._band, uniform, zi=self._band_state)
+        voiced *= np.where(within < 0.7, np.sin(np.pi * within / 0.7) ** 2, 0.0)
+        noise *= 0.05 + np.where(within > 0.6, np.sin(np.pi * (within - 0.6) / 0.4) ** 2, 0.0)
+        return 2.0 * voiced + 3.0 * noise
+
+    def _voice(self, times: np.ndarray) -> np.ndarray:
+        """Return a sum of equal harmonics, in closed form, with an RMS of 1."""
+        mean, excursion, speed = _PITCH
+        glide = excursion / speed * (1.0 - np.cos(2 * np.pi * speed * times))
+        half = np.pi * np.mod(mean * times + glide / (2 * np.pi), 1.0)  # half the phase of the fundamental
+        low = np.sin(half)
+        safe = np.where(np.abs(low) < 1e-9, 1.0, low)
+        count = self._harmonics
+        kernel = np.where(np.abs(low) < 1e-9, 2.0 * count + 1.0, np.sin((2 * count + 1) * half) / safe)
+        return (kernel - 1.0) / np.sqrt(2.0 * count)

@@ -1,0 +1,1 @@
+"""The ROS 1 door: the nodes bass, rosAFE and localizer, and clients of components."""

@@ -1,0 +1,147 @@
+"""The processor tree of the node: each processor is an activity, has a port, and is part of the diagnostics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError
+from rosafe.ros1.afe.choice_fallbacks import ChoiceFallbacks
+from rosafe.ros1.afe.ports import OutputPort, OutputPorts, element
+from rosafe.ros1.afe.processor_health import ProcessorHealth
+from rosafe.ros1.component import serialization
+from rosafe.ros1.component.activities import Activity
+from rosafe.ros1.component.component import ComponentNode
+from rosafe.ros1.component.frame_clock import LinearClock
+from rosafe.ros1.transport.publisher import NewestMessage, Publisher
+from rosafe.tree.block import Block
+from rosafe.tree.processor import Processor, next_output
+from rosafe.tree.processor_registry import Failure
+from rosafe.tree.tree import Tree
+
+MAX_TIME = 2**32 - 1.0  # s since 1970, of a ROS time
+
+
+class PublishedTree:
+    """A tree whose events open ports, publish blocks and end activities.
+
+    Parameters
+    ----------
+    node : ComponentNode
+    workers : int
+        Number of threads.
+    choices : ChoiceFallbacks
+    captured : callable
+        Returns the time at which an audio frame was captured; None if it is unknown.
+    catch_up : callable
+        Called when a port gets a subscriber: blocks that have arrived should be processed.
+
+    Attributes
+    ----------
+    tree : Tree
+    health : ProcessorHealth
+    """
+
+    def __init__(
+        self,
+        node: ComponentNode,
+        workers: int,
+        choices: ChoiceFallbacks,
+        captured: Callable[[int], LinearClock | None],
+        catch_up: Callable[[], object],
+    ) -> None:
+        self._node = node
+        self._choices = choices
+        self._captured = captured
+        self._catch_up = catch_up
+        self._ports = OutputPorts()
+        self._activities: dict[Processor, Activity] = {}
+        self._input_port = self._advertise("input")
+        self._time_class = serialization.message_class("rosAFE", "::rosAFE::frameTime")
+        self._frame_time = node.advertise("frameTime", self._time_class)
+        self._newest_time = NewestMessage(self._build_time)
+        self._newest_frame = (0, LinearClock(0.0, 0.0, 1.0))  # of `_newest_time`
+        self._meters = {kind: node.meters[ROSAFE.service(r.request).task] for kind, r in KINDS.items()}
+        self.tree = Tree(self, workers, real_time=True)
+        self.health = ProcessorHealth(self.tree, choices)
+        self.on_executed = self.health.executed
+
+    def run(self, activity: Activity, processor: Processor, save: Callable[[], None]) -> None:
+        """Run the `activity` of a processor: both end together. `save` is called after each change of the tree."""
+        self._activities[processor] = activity
+        if processor not in self.tree.processors:  # it may have ended before its activity was registered
+            activity.interrupt("")
+        self._node.settle()
+        save()  # before the client is notified that it runs
+        activity.running()
+        activity.stop_requested.wait()
+        self._activities.pop(processor, None)
+        self.tree.end(processor)
+        self._choices.forget(processor)
+        save()
+        self._node.settle()
+        if processor.error is not None:
+            raise ComponentError("::genom::unkex", what=str(Failure.of(processor)))
+
+    def next_output(self, block_frames: int) -> float:
+        """Return an index of audio: blocks of `block_frames` that end before it are not needed yet.
+
+        It is infinite if no port has subscribers, and 0 if each block is needed.
+        """
+        if self._ports.observed:
+            return 0
+        subscribed = self._ports.subscribed
+        if not subscribed:
+            return 0 if self._frame_time.has_subscribers else math.inf
+        released = [processor.last_block for processor in subscribed]
+        if any(block is None or block.signal.hop <= block_frames for block in released):
+            return 0
+        return min(map(next_output, subscribed))
+
+    # --- events of the tree, on its threads ---
+
+    def on_added(self, processor: Processor) -> None:
+        """Open the processor's port and publish zeros."""
+        if processor.kind == "input":
+            port = OutputPort(processor, self._input_port, lambda: None)
+        else:
+            publisher = self._advertise(processor.kind, processor.name)
+            port = OutputPort(processor, publisher, publisher.unregister)
+        self._ports.add(processor, port)
+        self.health.added(processor, self._meters[processor.kind])
+        port.publish()
+
+    def on_released(self, processor: Processor, block: Block) -> None:
+        """Publish the processor's window; for the input also the capture time of its newest frame."""
+        self._ports[processor].publish()
+        if processor.parent is None:
+            self._publish_frame_time(block.next_index - 1)
+
+    def _publish_frame_time(self, frame: int) -> None:
+        line = self._captured(frame)
+        if line is not None and 0 <= line.time < MAX_TIME:  # a publisher of audio can send any stamp
+            self._newest_frame = (frame, line)
+            self._frame_time.publish_newest(self._newest_time)
+
+    def _build_time(self) -> Any:
+        frame, line = self._newest_frame
+        seconds, nanoseconds = divmod(round(line.time * 1e9), 1_000_000_000)
+        return self._time_class(stamp={"sec": seconds, "nsec": nanoseconds}, frameIndex=frame, sampleRate=line.rate)
+
+    def on_removed(self, processor: Processor) -> None:
+        """Close the port and end the activity."""
+        self.health.ended(processor)
+        port = self._ports.remove(processor)
+        if port is not None:  # otherwise it could not be opened
+            port.close()
+        activity = self._activities.get(processor)
+        if activity is not None:
+            activity.interrupt("")
+
+    def _advertise(self, kind: str, name: str = "") -> Publisher:
+        message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
+        publisher = self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
+        publisher.impl.on_connection = self._catch_up
+        publisher.impl.on_subscribers_changed = self._ports.forget_subscribed
+        return publisher

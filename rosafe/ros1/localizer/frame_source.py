@@ -1,0 +1,303 @@
+"""The frames of the ports that localization needs: new ones of all four ports, with their times."""
+
+from __future__ import annotations
+
+import functools
+import struct
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import rospy
+
+from rosafe.audio.files.windows import MAX_INDEX, new_frames
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.interface import LAYOUTS
+from rosafe.localization import cues
+from rosafe.ros import FrameClock
+from rosafe.ros1.component import serialization
+
+READ_BYTES = 2**17  # per read of a subscriber
+KEPT_MESSAGES = 8  # of each port, until the other ports have the same block
+_HEAD = struct.Struct("<IQQ")  # the beginning of a message: sampleRate, lastFrameIndex, framesOnPort
+
+
+@dataclass(frozen=True)
+class FrameFormat:
+    """The frames of the ports: sizes in samples.
+
+    Attributes
+    ----------
+    sample_rate : float
+        Hz.
+    channels : int
+        Number of channels.
+    window, hop, block : int
+        Length and distance of frames, and the block of the input, in samples.
+    """
+
+    sample_rate: float
+    channels: int
+    window: int
+    hop: int
+    block: int
+
+    @property
+    def rest(self) -> float:
+        """Samples after the newest frame of a message: exact if the hop divides the block, otherwise an estimate."""
+        return -self.window % self.hop if self.block % self.hop == 0 else self.hop / 2
+
+
+@dataclass(frozen=True)
+class NewFrames:
+    """Successive frames of all representations.
+
+    Attributes
+    ----------
+    features : mapping
+        As for `Localizer.update`.
+    middles : ndarray, (F,)
+        The clock time of the middle of each frame, s.
+    lost : int
+        Number of frames that are missing before them.
+    """
+
+    features: Mapping[str, FloatArray]
+    middles: FloatArray
+    lost: int
+
+    def select(self, frames: Any) -> NewFrames:
+        """Return some of the frames: a slice, or an array of bool."""
+        features = {kind: array[..., frames] for kind, array in self.features.items()}
+        return NewFrames(features, self.middles[frames], 0)
+
+    @staticmethod
+    def joined(parts: Sequence[NewFrames]) -> NewFrames:
+        """Return all frames of `parts`."""
+        if len(parts) == 1:
+            return parts[0]
+        features = {
+            kind: np.concatenate([part.features[kind] for part in parts], axis=-1) for kind in parts[0].features
+        }
+        return NewFrames(features, np.concatenate([part.middles for part in parts]), 0)
+
+
+class StreamRestartedError(Exception):
+    """The index of the stream has fallen; the text says from where to where."""
+
+
+class _Undecoded:
+    """A message with the received bytes in `data`: most messages are replaced by newer ones before they are used."""
+
+    def deserialize(self, data: Any) -> Any:
+        self.data = data
+        return self
+
+    def decode(self) -> Any:
+        return super().deserialize(self.data)  # type: ignore[misc]  # of the message class
+
+
+@functools.cache
+def _message_class(idl: str) -> Any:
+    return type("Message", (_Undecoded, serialization.tolerant_message_class("rosAFE", idl)), {})
+
+
+class _Port:
+    """The messages of one port. All methods but `close` need the lock of the source."""
+
+    def __init__(self, topic: str, kind: str, format_: FrameFormat, source: FrameSource) -> None:
+        self.kind = kind
+        self.problem = ""
+        self.messages: dict[int, Any] = {}  # the newest, by lastFrameIndex
+        self.window = 0  # samples for which the newest message has frames
+        self.count = 0  # frames from the first block that was used to the end of the last one
+        self._format = format_
+        self._source = source
+        self._newest = 0
+        self._used: Any = None
+        self._subscriber = rospy.Subscriber(
+            topic,
+            _message_class(LAYOUTS[kind].idl),
+            self._receive,
+            queue_size=KEPT_MESSAGES,
+            buff_size=READ_BYTES,
+            tcp_nodelay=True,
+        )
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self._subscriber.unregister()
+
+    def _receive(self, message: Any) -> None:
+        with self._source.lock:
+            self._keep(message)
+            ready = bool(self.problem) or self._source.is_ready()
+        if ready:
+            self._source.received()
+
+    def _keep(self, message: Any) -> None:
+        if len(message.data) < _HEAD.size:
+            self.problem = f"{self.kind}: expected at least {_HEAD.size} bytes, got {len(message.data)}"
+            return
+        _, index, frames = _HEAD.unpack_from(message.data)
+        if index >= MAX_INDEX:
+            self.problem = f"{self.kind}: lastFrameIndex {index} is out of range"
+            return
+        if not index:  # a processor that has just started
+            return
+        if index < self._newest:  # another stream
+            self.messages.clear()
+        self._newest, self.window = index, frames * self._format.hop
+        while len(self.messages) >= KEPT_MESSAGES:
+            self.messages.pop(next(iter(self.messages)))
+        self.messages[index] = message
+
+    def decode(self, index: int) -> bool:
+        """Decode the message of a block; return whether it can be used. Otherwise it is dropped."""
+        message = self.messages[index].decode()
+        self.problem = message.problem or self._malformed(message)
+        if self.problem:
+            del self.messages[index]
+        return not self.problem
+
+    def _malformed(self, message: Any) -> str:
+        for samples in (message.left, message.right) if self.kind == "ratemap" else (message.left,):
+            shape = getattr(samples, "shape", ("of several lengths",))
+            if shape != (self._format.channels, message.framesOnPort) or not message.framesOnPort:
+                return f"{self.kind}: expected {self._format.channels} channels, got an array of shape {shape}"
+        return ""
+
+    def advance(self, index: int, before: int, first: int) -> None:
+        """Use the block up to `index`, after the one up to `before`; the first one was up to `first`."""
+        message, used, hop = self.messages[index], self._used, self._format.hop
+        self.messages = {other: kept for other, kept in self.messages.items() if other > index}
+        self._used = message
+        least = (index - first) // hop
+        if (index - first) % hop == 0:
+            self.count = least
+        else:
+            count = self.count + new_frames((index - before) / hop, message.left, used.left)
+            self.count = min(max(count, least), least + 1)  # windows of silence are all equal
+
+    @property
+    def first(self) -> int:
+        """The number of frames before the window of the block that was used last."""
+        return self.count - int(self._used.framesOnPort)
+
+    def frames(self, begin: int, end: int) -> FloatArray:
+        """Return the frames from `begin` to `end`, counted as `count`."""
+        columns = slice(begin - self.first, end - self.first)
+        if self.kind == "ratemap":
+            return np.stack((self._used.left[:, columns], self._used.right[:, columns]))
+        return np.asarray(self._used.left[:, columns])
+
+
+class FrameSource:
+    """New frames of the representations, from rospy's threads to the one that localizes.
+
+    Parameters
+    ----------
+    topics : mapping
+        The topic of each representation of `cues.KINDS`.
+    format_ : FrameFormat
+        Of the frames.
+    clock : FrameClock
+        Of the rosAFE node.
+    received : callable
+        Called when `take` returns frames, on rospy's threads.
+
+    Attributes
+    ----------
+    least : int
+        Samples of new sound for which `take` waits, unless the ports are shorter.
+    """
+
+    def __init__(
+        self, topics: Mapping[str, str], format_: FrameFormat, clock: FrameClock, received: Callable[[], None]
+    ) -> None:
+        self.format = format_
+        self.received = received
+        self.least = 0
+        self.lock = threading.Lock()
+        self._clock = clock
+        self._index = 0  # block that was used last
+        self._first = 0  # first block that was used
+        self._done = 0  # frames that were taken
+        self._end = 0.0  # last sample of frame 0, which is before the first that is taken
+        with self.lock:  # messages wait for the last port
+            self._ports = [_Port(topics[kind], kind, format_, self) for kind in cues.KINDS]
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        for port in self._ports:
+            port.close()
+
+    @property
+    def problem(self) -> str:
+        """Why messages cannot be used; empty if they can."""
+        return next((port.problem for port in self._ports if port.problem), self._clock.problem)
+
+    def _newest_block(self) -> int:
+        """Return the newest block that all ports have; 0 if there is none."""
+        first, *others = (port.messages for port in self._ports)
+        return max((index for index in first if all(index in messages for messages in others)), default=0)
+
+    def is_ready(self) -> bool:
+        """Return whether there are enough new blocks. Needs the lock."""
+        newest = self._newest_block()
+        new = newest - self._index
+        enough = new <= 0 or new >= self.least or new + self.format.block > min(port.window for port in self._ports)
+        return newest > 0 and enough
+
+    def _has_time(self, index: int) -> bool:
+        return self._clock.covers(index - 1, self.format.sample_rate)
+
+    @property
+    def missing(self) -> str:
+        """The kind of message that does not arrive: sound, or the times of frames that have arrived."""
+        with self.lock:
+            newest = self._newest_block()
+            return "sound: no new frames from rosAFE" if self._has_time(newest) or not newest else self._clock.topic
+
+    def take(self) -> NewFrames | None:
+        """Return the frames since the last call; None if they are not enough, or their times are not known yet.
+
+        The first call after messages have arrived returns none: frames are counted from there.
+
+        Raises
+        ------
+        StreamRestartedError
+            Another stream has started; the next call continues with it.
+        """
+        with self.lock:
+            newest = self._newest_block()
+            if not self.is_ready() or newest == self._index or not self._has_time(newest):  # or all are sent again
+                return None
+            if not all(port.decode(newest) for port in self._ports):
+                return None
+            before, self._index = self._index, newest
+            restarted = self._index < before
+            if not before or restarted:
+                self._first, self._done, self._end = self._index, 0, self._index - 1 - self.format.rest
+            for port in self._ports:
+                port.advance(self._index, before, self._first)
+            if restarted:
+                raise StreamRestartedError(f"the frame index fell from {before} to {self._index}")
+            return self._new()
+
+    def _new(self) -> NewFrames | None:
+        first = max(self._done, *(port.first for port in self._ports))
+        end = min(port.count for port in self._ports)
+        if end <= first:
+            return None
+        lost, self._done = first - self._done, end
+        hop = self.format.hop
+        # The position of the frames in the block is known better with each block, if the hop does not divide it.
+        newest = min(max(self._end + end * hop, self._index - hop), self._index - 1)
+        self._end = newest - end * hop
+        moment = self._clock.time(newest).ros.to_sec()
+        back = np.arange(end - first - 1, -1, -1) * hop + self.format.window / 2
+        features = {port.kind: port.frames(first, end) for port in self._ports}
+        return NewFrames(features, moment - back / self.format.sample_rate, lost)

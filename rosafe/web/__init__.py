@@ -1,0 +1,1 @@
+"""The HTTP door: the server genomixd and the live page."""

@@ -1,0 +1,483 @@
+"""The HTTP interface of genomixd (docs/genomixd.md) on aiohttp: routes, access checks and answers."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from http import HTTPStatus
+from typing import Any, TypeVar
+from urllib.parse import unquote_to_bytes
+
+from aiohttp import web
+
+from rosafe.interface import ComponentError
+from rosafe.ros1.client.asyncio_tools import wait_any
+from rosafe.ros1.client.component_client import Call, ComponentClient, Value
+from rosafe.ros1.client.errors import bad_value, middleware_error
+from rosafe.ros1.client.values import parse_input
+from rosafe.system.version import VERSION
+from rosafe.web.genomix import binary_format
+from rosafe.web.genomix.activity_request import Request
+from rosafe.web.genomix.names import Names
+from rosafe.web.genomix.sessions import Session, Sessions
+from rosafe.web.genomix.text_formats import JSON, SYNTAXES, TCL, Syntax, plain, structure
+from rosafe.web.server.access import check_host, check_no_browser
+from rosafe.web.server.connections import Connections, Limits
+from rosafe.web.server.listener import HttpListener, connection_of
+from rosafe.web.server.refusal import HttpRefusal
+
+MAX_WAIT_MS = 3_600_000
+FORMATTERS = 4  # threads
+BATCH = 128 * 1024  # characters written at a time
+REFUSAL_SECONDS = 0.05  # from the acknowledgement of a rejected request to its error
+ANSWER_SECONDS = 75.0  # for any answer except /request/wait; a component has 60 s of these
+HEARTBEAT_SECONDS = 15.0  # between two lines to an event listener
+SHUTDOWN_SECONDS = 1.0  # for answers in progress at the end
+
+LIMITS = Limits(
+    max_connections=2000,
+    max_url=256 * 1024,  # a list of 1024 numbers fits, percent-encoded
+    max_header_bytes=16 * 2**20,
+    max_answers=512 * 2**20,
+    request_seconds=15.0,
+    idle_seconds=3600.0,
+)
+
+log = logging.getLogger("genomixd")
+
+_STATUS = {
+    "::genom::serialization": 400,
+    "::genom::no_such_service": 404,
+    "::genom::no_such_outport": 404,
+    "::genomix::e_noSuchRequest": 404,
+    "::genomix::e_load": 404,
+    "::genomix::e_forbidden": 403,
+    "::genomix::e_url": 404,
+    "::genomix::e_notDone": 409,
+    "::genom::mwerr": 502,
+    "::genom::unkex": 500,
+    "::genomix::e_tooMany": 503,
+}
+_COMPONENT_ERROR = 422  # the component has rejected the request
+_SESSION_NAME = re.compile(r"[\w.:@-]{1,100}")
+_PACKED = "packed"  # the only binary syntax
+_HELP = """genomixd {version}: HTTP access (GET) to the components of the ROS graph.
+Namespace: {namespace}
+Answers are JSON; with syntax=tcl they are Tcl dicts, with syntax=packed binary data for MATLAB and Octave.
+/session/start?s=NAME  /session/stop?s=NAME  /session/listen?s=NAME (server-sent events: request, unload, quit)
+/load/COMPONENT[?i=INSTANCE][&as=NAME]  /unload/NAME  /describe/NAME  /components  /rpath?dir=DIR
+/call/NAME/SERVICE[?input=JSON]  /call/NAME/PORT[/ELEMENT]      waits for the result; an activity returns once it runs
+/call/NAME/request?input=["ild",{{"fb_nChannels":16}}]          builds a representation with all that it needs
+/send/NAME/SERVICE[?input=JSON][&ack][&oneway]                  returns the request's id and status immediately
+/request/status?id=ID  /request/result?id=ID  /request/wait?id=ID[&ms=N][&ack]
+/request/abort?id=ID  /request/clean?id=ID  /requests
+Every URL accepts s=SESSION. See docs/genomixd.md for details.
+"""
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+T = TypeVar("T")
+
+
+class HttpApi:
+    """The HTTP server for `sessions`.
+
+    Parameters
+    ----------
+    sessions : Sessions
+    names : Names
+        Names of this machine that are accepted in addition to IP addresses and localhost.
+    """
+
+    def __init__(self, sessions: Sessions, names: Names) -> None:
+        self._sessions = sessions
+        self._names = names
+        app = web.Application(middlewares=[self._guard])
+        for path, handler in (
+            ("/", self._help),
+            ("/session/start", self._session_start),
+            ("/session/stop", self._session_stop),
+            ("/session/listen", self._session_listen),
+            ("/load/{component:.+}", self._load),
+            ("/unload/{name}", self._unload),
+            ("/describe/{name}", self._describe),
+            ("/components", self._components),
+            ("/rpath", self._rpath),
+            ("/call/{name}/{service}", self._call),
+            ("/call/{name}/{service}/{element:.+}", self._call),
+            ("/send/{name}/{service}", self._send),
+            ("/send/{name}/{service}/{element:.+}", self._send),
+            ("/request/status", self._request_status),
+            ("/request/result", self._request_result),
+            ("/request/wait", self._request_wait),
+            ("/request/abort", self._request_abort),
+            ("/request/clean", self._request_clean),
+            ("/requests", self._requests),
+        ):
+            app.router.add_get(path, handler, allow_head=False)
+        self._connections = Connections(LIMITS, _format_refusal, log)
+        self._listener = HttpListener(app, self._connections)
+        # A few threads for all results: more would only compete for the GIL.
+        self._formatters = ThreadPoolExecutor(FORMATTERS, "format")
+
+    async def start(self, host: str, port: int) -> int:
+        """Listen and return the port; OSError if the address cannot be used."""
+        return await self._listener.start(host, port, log if log.isEnabledFor(logging.DEBUG) else None)
+
+    async def close(self) -> None:
+        """Stop listening, and end all sessions and connections."""
+        self._listener.stop_listening()
+        await self._sessions.close()
+        await self._listener.close(SHUTDOWN_SECONDS)
+        self._formatters.shutdown(wait=False, cancel_futures=True)
+
+    # --- access ---
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Reject requests from web pages, and return every error in the client's syntax."""
+        session: Session | None = None
+        connection_of(request).request_parsed()
+        try:
+            await self._check_host(request)
+            check_no_browser(request.headers)
+            _check_url(request)
+            if not _is_packed(request):
+                _syntax(request)
+            if not request.path.startswith("/session/"):
+                session = self._session(request)
+                session.busy += 1
+            return await handler(request)
+        except HttpRefusal as refusal:
+            answer = _error(request, _refusal_error(refusal))
+            if refusal.status == HTTPStatus.FORBIDDEN:
+                answer.set_status(refusal.status)  # also of a packed answer: clients use the status
+            answer.force_close()
+            return answer
+        except ComponentError as problem:
+            return _error(request, problem)
+        except web.HTTPException as problem:
+            what = f"{request.method} {request.path[:200]}: {problem.reason}; see /"
+            return _error(request, ComponentError("::genomix::e_url", what=what), problem.status)
+        except (ConnectionResetError, asyncio.CancelledError):
+            raise
+        except Exception as problem:  # an internal error: the log gets the traceback, the client one line
+            log.exception("%s", request.path_qs[:500])
+            return _error(request, ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127]))
+        finally:
+            if session is not None:
+                session.busy -= 1
+                session.touch()
+
+    async def _check_host(self, request: web.Request) -> None:
+        advice = "genomixd --name NAME accepts a further name"
+        try:
+            check_host(request.headers, self._names.known, advice)
+        except HttpRefusal:
+            check_host(request.headers, await self._names.from_parameter(), advice)
+
+    def _session(self, request: web.Request) -> Session:
+        name = request.query.get("s", "")
+        if name and not _SESSION_NAME.fullmatch(name):
+            raise bad_value(f"s: expected up to 100 letters, digits and . : @ _ -, got {name[:100]!r}")
+        return self._sessions.get(name, connection_of(request).account.address)
+
+    # --- sessions ---
+
+    async def _help(self, request: web.Request) -> web.Response:
+        return _text(_HELP.format(version=VERSION, namespace=self._sessions.graph.resolve("")))
+
+    async def _session_start(self, request: web.Request) -> web.Response:
+        if not request.query.get("s"):
+            raise bad_value("s: expected the name of the session")
+        return _text(self._session(request).name)
+
+    async def _session_stop(self, request: web.Request) -> web.Response:
+        await self._sessions.stop(request.query.get("s", ""))
+        return _text("")
+
+    async def _session_listen(self, request: web.Request) -> web.StreamResponse:
+        with self._connections.long_poll(connection_of(request)):
+            return await _send_events(request, self._session(request), _syntax(request))
+
+    # --- components ---
+
+    async def _load(self, request: web.Request) -> web.StreamResponse:
+        name = request.query.get("as", "")
+        if name and not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
+            raise bad_value(f"as: expected a letter, followed by letters, digits and _, got {name[:80]!r}")
+        component, instance = request.match_info["component"], request.query.get("i", "")
+        return _small(request, await self._in_time(self._session(request).load(component, instance, name)))
+
+    async def _unload(self, request: web.Request) -> web.StreamResponse:
+        await self._in_time(self._session(request).unload(request.match_info["name"]))
+        return _small(request, {})
+
+    async def _describe(self, request: web.Request) -> web.StreamResponse:
+        name = request.match_info["name"]
+        return _small(request, (await self._in_time(self._component(request))).describe(name))
+
+    async def _components(self, request: web.Request) -> web.StreamResponse:
+        loaded = self._session(request).components
+        return _small(request, {n: {"component": p.component.name, "instance": p.instance} for n, p in loaded.items()})
+
+    async def _rpath(self, request: web.Request) -> web.StreamResponse:
+        # Does nothing, because components are found on the graph. Scripts for the original use it to find plugins.
+        return _small(request, {})
+
+    # --- requests ---
+
+    async def _component(self, request: web.Request) -> ComponentClient:
+        name = request.match_info["name"]
+        return await self._session(request).component(name, request.query.get("i", ""))
+
+    async def _prepare(self, request: web.Request) -> Call:
+        text_args = parse_input(request.query.get("input", request.query.get("argv", "")))
+        element = request.match_info.get("element", request.query.get("element", ""))
+        return (await self._component(request)).prepare_call(request.match_info["service"], text_args, element)
+
+    async def _in_time(self, work: Coroutine[Any, Any, T]) -> T:
+        """Return the result of `work`, or raise ``::genom::mwerr`` after `ANSWER_SECONDS`.
+
+        The work is then cancelled, but not awaited, because undoing it may take equally long.
+        """
+        task = asyncio.create_task(work)
+        self._sessions.keep(task)
+        try:
+            await asyncio.wait({task}, timeout=ANSWER_SECONDS)
+        finally:
+            in_time = task.done()
+            task.cancel()
+        if not in_time:
+            raise middleware_error(f"no answer within {ANSWER_SECONDS:g} s; other requests take too long")
+        return task.result()
+
+    async def _call(self, request: web.Request) -> web.StreamResponse:
+        async def work() -> Value:
+            return await self._session(request).call(await self._prepare(request))
+
+        return await self._stream(request, await self._in_time(work()))
+
+    async def _send(self, request: web.Request) -> web.StreamResponse:
+        call = await self._in_time(self._prepare(request))
+        oneway = _flag(request, "oneway")
+        sent = self._session(request).send(request.match_info["name"], call, not oneway, len(request.raw_path))
+        if oneway:
+            return _small(request, {})
+        if _flag(request, "ack"):
+            await _accepted(sent, ANSWER_SECONDS)
+        return _status(request, sent)
+
+    def _known(self, request: web.Request) -> Request:
+        return self._session(request).request(request.query.get("id", ""))
+
+    async def _request_status(self, request: web.Request) -> web.StreamResponse:
+        return _status(request, self._known(request))
+
+    async def _request_result(self, request: web.Request) -> web.StreamResponse:
+        known = self._known(request)
+        if known.error is not None:
+            raise known.error
+        if known.status == "sent":
+            raise ComponentError("::genomix::e_notDone", what=f"{known.id} has not finished yet")
+        return await self._stream(request, known.value)
+
+    async def _request_wait(self, request: web.Request) -> web.StreamResponse:
+        known, seconds = self._known(request), _milliseconds(request) / 1000
+        connection = connection_of(request)
+        with self._connections.long_poll(connection):
+            if _flag(request, "ack"):
+                await _accepted(known, seconds, connection.gone)
+            else:
+                await wait_any(known.finished, connection.gone, timeout=seconds)
+        return _status(request, known)
+
+    async def _request_abort(self, request: web.Request) -> web.StreamResponse:
+        known = self._known(request)
+        known.abort()
+        return _status(request, known)
+
+    async def _request_clean(self, request: web.Request) -> web.StreamResponse:
+        self._session(request).clean(request.query.get("id", ""))
+        return _small(request, {})
+
+    async def _requests(self, request: web.Request) -> web.StreamResponse:
+        return _small(request, {r.id: r.status for r in self._session(request).requests.values()})
+
+    async def _stream(self, request: web.Request, value: Value) -> web.StreamResponse:
+        """Send a value of any size; pieces of a large one are formatted on a thread, as fast as the client reads."""
+        pieces = _encoded(request, value)
+        if value.size <= BATCH // 8:
+            return _respond(request, b"".join(pieces))
+        with self._connections.reading_answer(connection_of(request), value.data, value.size):
+            return await self._stream_pieces(request, pieces)
+
+    async def _stream_pieces(self, request: web.Request, pieces: Iterator[bytes]) -> web.StreamResponse:
+        response = web.StreamResponse(headers={"Content-Type": _media_type(request), **_HEADERS})
+        await response.prepare(request)
+        loop = asyncio.get_running_loop()
+        while batch := await loop.run_in_executor(self._formatters, _batch, pieces):
+            await response.write(batch)
+        await response.write_eof()
+        return response
+
+
+async def _send_events(request: web.Request, session: Session, syntax: Syntax) -> web.StreamResponse:
+    """Send the events of a session to a listener until the session ends."""
+    queue = session.listen()
+    try:
+        response = web.StreamResponse(headers={"Content-Type": "text/event-stream", **_HEADERS})
+        await response.prepare(request)
+        await response.write(b": genomixd\n\n")
+        while True:
+            try:
+                event, data = await asyncio.wait_for(queue.get(), HEARTBEAT_SECONDS)
+            except TimeoutError:
+                await response.write(b":\n\n")
+                continue
+            if isinstance(data, Request):
+                data = "".join(_unwrapped(syntax, data.pieces(syntax)))
+            elif data:
+                data = _plain_text(syntax, data)
+            await response.write(_utf8(f"event: {event}\ndata: {data}\n\n"))
+            if event == "quit":
+                return response
+    finally:
+        session.leave(queue)
+
+
+# --- reading ----------------------------------------------------------------------------------------------------
+
+
+def _check_url(request: web.Request) -> None:
+    """Raise ``::genom::serialization`` if the URL is not UTF-8: aiohttp would silently decode another text."""
+    try:
+        unquote_to_bytes(request.raw_path.encode("utf-8", "surrogateescape")).decode()
+    except UnicodeDecodeError:
+        raise bad_value("URL: expected UTF-8") from None
+
+
+def _is_packed(request: web.Request) -> bool:
+    return request.query.get("syntax") == _PACKED
+
+
+def _syntax(request: web.Request) -> Syntax:
+    name = request.query.get("syntax", "json")
+    if name not in SYNTAXES:
+        raise bad_value(f"syntax: expected one of {', '.join((*SYNTAXES, _PACKED))}, got {name[:20]!r}")
+    return SYNTAXES[name]
+
+
+def _answer_syntax(request: web.Request) -> Syntax:
+    """Return the syntax of an answer; JSON for the error about an unknown syntax."""
+    return SYNTAXES.get(request.query.get("syntax", "json"), JSON)
+
+
+async def _accepted(sent: Request, seconds: float, *events: asyncio.Event) -> None:
+    """Wait until the activity runs or has failed, for an event, or for some seconds."""
+    await wait_any(sent.acknowledged, *events, timeout=seconds)
+    if sent.acknowledged.is_set():
+        await wait_any(sent.finished, *events, timeout=REFUSAL_SECONDS)
+
+
+def _flag(request: web.Request, name: str) -> bool:
+    return request.query.get(name, "0").lower() not in ("0", "false", "no")
+
+
+def _milliseconds(request: web.Request) -> int:
+    text = request.query.get("ms", str(MAX_WAIT_MS))
+    if not re.fullmatch(r"[0-9]{1,9}", text):
+        raise bad_value(f"ms: expected a number of milliseconds, got {text[:20]!r}")
+    return min(int(text), MAX_WAIT_MS)
+
+
+# --- writing ----------------------------------------------------------------------------------------------------
+
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+
+def _text(text: str) -> web.Response:
+    return web.Response(text=text, headers=_HEADERS)
+
+
+def _utf8(text: str) -> bytes:
+    """Encode a text. An unpaired surrogate, which a node may send, has no UTF-8 and is escaped, as in exdetail."""
+    return text.encode("utf-8", "backslashreplace")
+
+
+def _unwrapped(syntax: Syntax, pieces: Iterator[str]) -> Iterator[str]:
+    """Yield a complete document: without the outermost braces in Tcl, which would make it a list of one element."""
+    if syntax is not TCL:
+        yield from pieces
+        return
+    previous = next(pieces)[1:]
+    for piece in pieces:
+        yield previous
+        previous = piece
+    yield previous[:-1]
+
+
+def _plain_text(syntax: Syntax, value: Any) -> str:
+    """Return the complete document of a small value without a type."""
+    return "".join(_unwrapped(syntax, iter((plain(syntax, value),))))
+
+
+def _encoded(request: web.Request, value: Value | Request) -> Iterator[bytes]:
+    if _is_packed(request):
+        return value.packed() if isinstance(value, Request) else binary_format.structure(*value.content)
+    syntax = _syntax(request)
+    pieces = value.pieces(syntax) if isinstance(value, Request) else structure(syntax, *value.content)
+    return (_utf8(piece) for piece in _unwrapped(syntax, pieces))
+
+
+def _media_type(request: web.Request) -> str:
+    if _is_packed(request):
+        return "application/octet-stream"
+    return f"{_answer_syntax(request).media_type}; charset=utf-8"
+
+
+def _respond(request: web.Request, body: bytes, status: int = 200) -> web.Response:
+    return web.Response(body=body, status=status, headers={"Content-Type": _media_type(request), **_HEADERS})
+
+
+def _small(request: web.Request, value: Any) -> web.Response:
+    if _is_packed(request):
+        return _respond(request, binary_format.plain(value))
+    return _respond(request, _utf8(_plain_text(_syntax(request), value)))
+
+
+def _error(request: web.Request, error: ComponentError, status: int = 0) -> web.Response:
+    if _is_packed(request):  # MATLAB and Octave ignore the body of an answer with another status than 200
+        return _respond(request, binary_format.error(error.body))
+    body = _utf8(_plain_text(_answer_syntax(request), error.body))
+    return _respond(request, body, status or _STATUS.get(error.ex, _COMPONENT_ERROR))
+
+
+def _refusal_error(refusal: HttpRefusal) -> ComponentError:
+    ex = {403: "e_forbidden", 503: "e_tooMany"}.get(refusal.status, "e_url")
+    return ComponentError(f"::genomix::{ex}", what=str(refusal))
+
+
+def _format_refusal(refusal: HttpRefusal) -> tuple[bytes, str]:
+    return _utf8(plain(JSON, _refusal_error(refusal).body)), JSON.media_type
+
+
+def _status(request: web.Request, known: Request) -> web.Response:
+    return _respond(request, b"".join(_encoded(request, known)))
+
+
+def _batch(pieces: Iterator[bytes]) -> bytes:
+    parts: list[bytes] = []
+    size = 0
+    for piece in pieces:
+        parts.append(piece)
+        size += len(piece)
+        if size >= BATCH:
+            break
+    return b"".join(parts)

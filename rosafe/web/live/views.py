@@ -1,0 +1,322 @@
+"""The views that pages have subscribed to, shared by all pages, with the last seconds of each."""
+
+from __future__ import annotations
+
+import itertools
+import struct
+import threading
+import time
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from rosafe.audio.files.levels import LevelMeter
+from rosafe.interface import KINDS
+from rosafe.ros1.client.errors import too_many
+from rosafe.web.live import directions
+from rosafe.web.live.plot_data import MAX_COLUMN_RATE, PlotLayout, ProcessorInfo, TreeSnapshot, quantize
+from rosafe.web.live.ports import Audio, PortReader
+
+HISTORY_SECONDS = 12.0  # sent to a page when it subscribes
+MAX_VIEWS = 256  # of all pages
+
+QUANTISED, FLOAT = 0, 1
+MAX_COLUMN = 2**53  # the largest integer that JavaScript represents exactly
+# number of the view, columns, numbers in a column, first column, end (s), minimum and maximum, form, stride
+PIECE = struct.Struct("<IHHQdffBB6x")
+
+_numbers = itertools.count(1)
+
+
+@dataclass(frozen=True)
+class Key:
+    """Identifies a view: the plot of a processor, the directions of the localizer, or the levels."""
+
+    what: str  # picture, directions, levels
+    name: str = ""
+    part: int = 0
+    row: int = -1
+
+
+class View:
+    """The newest columns of a plot. Written by the threads of rospy, read by the event loop.
+
+    Columns are numbered from the start of the audio; `restarts` counts how often the audio has restarted.
+    """
+
+    def __init__(self, size: int, rate: float, form: int, description: Mapping[str, Any] | None = None) -> None:
+        self.number = next(_numbers)
+        self.description = description or {}  # for the page
+        self.size, self.rate, self.form = size, rate, form
+        self.capacity = max(8, round(HISTORY_SECONDS * rate))
+        self.users = 0
+        self.restarts = 0
+        self.next = 0  # number of the column after the newest one
+        self.oldest = 0
+        self.end = 0.0  # s of the audio
+        self._ring = np.full((size, self.capacity), np.nan, np.float32)
+        self._lock = threading.Lock()
+        self._last_piece: tuple[Hashable, bytes] = ((), b"")  # shared by the pages
+
+    @property
+    def column_bytes(self) -> int:
+        """Bytes of a column in a message."""
+        return self.size * (4 if self.form == FLOAT else 1)
+
+    def append(self, first: int, columns: np.ndarray, end: float) -> None:
+        """Append columns (size, n) from number `first` on; columns between the newest one and `first` were lost."""
+        columns = columns[:, -self.capacity :]
+        after = first + columns.shape[1]
+        with self._lock:
+            if not self.oldest <= self.next <= first or first - self.next > self.capacity:
+                self.restarts += 1
+                self.next = self.oldest = first
+            for column in range(self.next, first):
+                self._ring[:, column % self.capacity] = np.nan
+            self._ring[:, self._ring_indices(first, after)] = columns
+            self.next, self.end = after, end
+            self.oldest = max(self.oldest, after - self.capacity)
+
+    def _ring_indices(self, first: int, after: int, stride: int = 1) -> np.ndarray:
+        """Return the indices of columns in the ring; the column numbers may exceed the integers of numpy."""
+        return np.arange(first % self.capacity, first % self.capacity + after - first, stride) % self.capacity
+
+    def newest(self, count: int) -> np.ndarray:
+        """Return the newest columns, float32 (size, count); missing ones are NaN."""
+        columns = np.full((self.size, count), np.nan, np.float32)
+        with self._lock:
+            first = max(self.oldest, self.next - count)
+            if self.next > first:
+                columns[:, -(self.next - first) :] = self._ring[:, self._ring_indices(first, self.next)]
+        return columns
+
+    def piece(self, first: int, stride: int, max_columns: int) -> tuple[int, bytes]:
+        """Return the next column to send, and every `stride`-th column from `first` on as bytes."""
+        with self._lock:
+            first = max(first, self.oldest)
+            first += -first % stride
+            count = min(max_columns, (self.next - first) // stride)
+            if count <= 0:
+                return first, b""
+            after = first + count * stride
+            key = (first, stride, count, self.restarts)
+            if self._last_piece[0] != key:
+                columns = self._ring[:, self._ring_indices(first, after, stride)]
+                low = high = 0.0
+                if self.form == QUANTISED:
+                    low, high, data = quantize(columns)
+                else:
+                    data = np.ascontiguousarray(columns.T, "<f4").tobytes()
+                if after > MAX_COLUMN:
+                    raise ValueError(f"expected columns up to number {MAX_COLUMN}, got {first}")
+                end = self.end - (self.next - after) / self.rate
+                header = PIECE.pack(self.number, count, self.size, first, end, low, high, self.form, stride)
+                self._last_piece = key, header + data + bytes(-len(data) % 8)
+            return after, self._last_piece[1]
+
+
+class _SharedSubscription:
+    """A port and the views that use it."""
+
+    def __init__(self, port: PortReader) -> None:
+        self.port = port
+        self.callbacks: dict[Key, Callable[[PortReader, Any], None]] = {}
+
+
+class Hub:
+    """All views. Its methods may block on the master for a moment: call them on a thread.
+
+    Parameters
+    ----------
+    bass, localizer : str
+        Full names of the nodes that capture the audio and localize.
+    on_new_columns : callable
+        Called on a thread of rospy when a view has new columns.
+    """
+
+    def __init__(self, bass: str, localizer: str, on_new_columns: Callable[[], None]) -> None:
+        self.tree = TreeSnapshot()
+        self.audio: Audio | None = None
+        self.latencies: dict[str, float] = {}  # s, by topic: from the capture of the newest frame to its arrival
+        self._bass, self._localizer = bass, localizer
+        self._directions: directions.DirectionTopics | None = None
+        self._on_new_columns = on_new_columns
+        self._views: dict[Key, View] = {}
+        self._subscriptions: dict[str, _SharedSubscription] = {}
+        self._topics: dict[Key, list[str]] = {}
+        self._lock = threading.RLock()
+        self._closed = False
+
+    def close(self) -> None:
+        """Close all ports permanently. A subscription in progress is rejected."""
+        with self._lock:
+            self._closed = True
+            for key in list(self._views):
+                self._remove(key)
+
+    # --- subscriptions of pages ---
+
+    def subscribe(self, key: Key) -> View:
+        """Return a view, and count one more user; raise ValueError if it does not exist."""
+        with self._lock:
+            if key not in self._views:
+                if self._closed:
+                    raise ValueError("the page is closing")
+                if len(self._views) >= MAX_VIEWS:
+                    raise too_many(f"the limit of {MAX_VIEWS} open plots is reached")
+                self._begin(key)
+            self._views[key].users += 1
+            return self._views[key]
+
+    def unsubscribe(self, key: Key, view: View) -> None:
+        """Count one user less; without users, the view and the ports that no other view uses are closed."""
+        with self._lock:
+            if self.shows(key, view):  # otherwise, a change of the tree has replaced it
+                view.users -= 1
+                if view.users <= 0:
+                    self._remove(key)
+
+    def shows(self, key: Key, view: View) -> bool:
+        """Return whether `view` is still the view of `key`."""
+        with self._lock:
+            return self._views.get(key) is view
+
+    def _remove(self, key: Key) -> None:
+        del self._views[key]
+        if key.what == "levels" and self.audio is not None:
+            self.audio.close()
+            self.audio = None
+        if key.what == "directions" and self._directions is not None:
+            self._directions.close()
+            self._directions = None
+        for topic in self._topics.pop(key, ()):
+            subscription = self._subscriptions[topic]
+            subscription.callbacks.pop(key, None)
+            if not subscription.callbacks:
+                subscription.port.close()
+                del self._subscriptions[topic]
+                self.latencies.pop(topic, None)
+
+    def _begin(self, key: Key) -> None:
+        if key.what == "levels":
+            view = View(6, 20.0, FLOAT, {"mode": "levels", "rows": 3, "ears": 2, "rate": 20.0})
+            self._views[key] = view
+            self.audio = Audio(f"{self._bass}/Audio", partial(_append_levels, view, self._on_new_columns))
+            return
+        if key.what == "directions":
+            self._views[key] = view = View(directions.SIZE, directions.RATE, FLOAT, directions.description())
+            self._directions = directions.DirectionTopics(
+                lambda: self.audio,
+                partial(_append_directions, view, self._on_new_columns),
+                self._bass,
+                self._localizer,
+            )
+            return
+        processor = self.tree.processors.get(key.name)
+        if processor is None or not self.tree.sample_rate:
+            raise ValueError(f"unknown processor {key.name!r}")
+        if processor.kind not in KINDS:
+            raise ValueError(f"{processor.name}: {processor.kind} belongs to a plugin that is not installed here")
+        if not processor.rate or len(processor.shape) < max(len(part.axes) for part in KINDS[processor.kind].parts) - 1:
+            raise ValueError(f"{processor.name}: shape and rate of its frames are unknown")
+        layout = PlotLayout(self.tree, processor, key.part, key.row)
+        form = QUANTISED if layout.mode == "heat" else FLOAT
+        self._views[key] = view = View(layout.size, layout.rate, form, layout.describe())
+        self._read_port(key, processor, partial(_append_columns, layout, view, self._on_new_columns))
+
+    def _read_port(self, key: Key, processor: ProcessorInfo, callback: Callable[[PortReader, Any], None]) -> None:
+        topic = processor.topic
+        if topic not in self._subscriptions:
+            port = PortReader(processor, processor.output_shape(), self.tree.sample_rate, self._dispatch)
+            self._subscriptions[topic] = _SharedSubscription(port)
+        self._subscriptions[topic].callbacks[key] = callback
+        self._topics.setdefault(key, []).append(topic)
+
+    def _dispatch(self, port: PortReader, message: Any) -> None:
+        with self._lock:  # the first message may arrive while the first callback is being added
+            subscription, audio = self._subscriptions.get(port.topic), self.audio
+            if subscription is None or subscription.port is not port:
+                return
+            callbacks = list(subscription.callbacks.values())
+        captured = audio.captured_at(port.index) if audio is not None else None
+        if captured is not None:
+            self.latencies[port.topic] = time.time() - captured
+        for callback in callbacks:
+            callback(port, message)
+
+    # --- changes of the tree ---
+
+    def on_tree_changed(self, tree: TreeSnapshot) -> set[Key]:
+        """Replace the tree, close the views that are affected by its changes, and return their keys."""
+        with self._lock:
+            before, self.tree = self.tree, tree
+            changed = {
+                key
+                for key in self._views
+                if key.what == "picture" and _dependencies(key, before) != _dependencies(key, tree)
+            }
+            for key in changed:
+                self._remove(key)
+            return changed
+
+    @property
+    def problems(self) -> dict[str, str]:
+        """Why the latest messages were ignored, by topic."""
+        audio = self.audio
+        topics = [*([audio] if audio else []), *(one.port for one in list(self._subscriptions.values()))]
+        return {one.topic: problem for one in topics if (problem := one.problem)}
+
+    @property
+    def lost(self) -> int:
+        """Frames of ports that were not received."""
+        return sum(one.port.lost for one in list(self._subscriptions.values()))
+
+
+def _dependencies(key: Key, tree: TreeSnapshot) -> list[Any]:
+    """Return everything in the tree that determines a view."""
+    processor = tree.processors.get(key.name)
+    dependencies: list[Any] = [tree.sample_rate]
+    return dependencies + [(ancestor, dict(ancestor.values)) for ancestor in tree.ancestors(processor)]
+
+
+def _append_columns(
+    layout: PlotLayout, view: View, on_new_columns: Callable[[], None], port: PortReader, message: Any
+) -> None:
+    """Append the new frames of a message to a view as columns."""
+    arrays = [getattr(message, field) for field in layout.fields]
+    frames = arrays[0].shape[-1]
+    group = layout.group
+    after = port.newest // group
+    # the first new column, or the first one of which the window has all frames
+    first = -(-(port.newest - port.fresh - (group - 1)) // group) if port.fresh < frames else 0
+    if view.next and 0 <= view.next <= after:
+        first = view.next
+    first = max(first, -(-(port.newest - frames) // group), 0)
+    if after <= first:
+        return
+    start = frames - (port.newest - first * group)
+    cut = [array[..., start : start + (after - first) * group] for array in arrays]
+    view.append(first, layout.columns(cut), port.end - (port.newest - after * group) / port.rate)
+    on_new_columns()
+
+
+def _append_levels(view: View, on_new_columns: Callable[[], None], samples: np.ndarray, end: float) -> None:
+    """Append the levels of the audio to a view: peak and RMS (dBFS) and the number of clipped samples of each ear."""
+    meter = LevelMeter()
+    meter.add(samples)
+    column = [number for ear in range(2) for number in (meter.peak(ear), meter.rms(ear), float(meter.clipped[ear]))]
+    view.append(view.next, np.array(column, np.float32)[:, np.newaxis], end)
+    on_new_columns()
+
+
+def _append_directions(
+    view: View, on_new_columns: Callable[[], None], first: int, columns: np.ndarray, end: float
+) -> None:
+    view.append(first, columns, end)
+    on_new_columns()
+
+
+assert MAX_COLUMN_RATE * HISTORY_SECONDS < 2**16  # columns of a piece are a uint16

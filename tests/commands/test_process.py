@@ -1,0 +1,261 @@
+"""`rosafe process`: the numbers of `rosafe.process`, bit for bit, for all kinds of files; paths of the results."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import soundfile
+
+from rosafe import load, process
+from rosafe.interface import CORE_REPRESENTATIONS, KINDS
+from tests.commands.command import SMALL, SMALL_PARAMETERS, as_int32, noise, rosafe, write
+from tests.harness import shared
+
+BESIDES = {"block_frames", "source"}
+FRAMES = ["ild", "ratemap", "crossCorrelation"]
+SEVEN = ("--outputs", ",".join(CORE_REPRESENTATIONS))
+
+
+def assert_equal(path: Path, expected: dict[str, Any]) -> None:
+    """Assert that the file contains exactly the results of `rosafe.process` and the additions of the command."""
+    loaded = load(path)
+    assert set(loaded) == {*expected, *BESIDES}
+    for name, value in expected.items():
+        np.testing.assert_array_equal(loaded[name], value, strict=isinstance(value, np.ndarray), err_msg=name)
+
+
+def test_integer_files(tmp_path: Path) -> None:
+    kinds = {
+        "u8.wav": ("PCM_U8", 8),
+        "16.wav": ("PCM_16", 16),
+        "24.wav": ("PCM_24", 24),
+        "32.wav": ("PCM_32", 32),
+        "flac.flac": ("PCM_16", 16),
+        "aiff.aiff": ("PCM_24", 24),
+    }
+    signals = {}
+    for name, (subtype, bits) in kinds.items():
+        full = 2 ** (bits - 1)
+        signals[name] = np.random.default_rng(bits).integers(-full, full, (2, 5000)) / full  # exact in this format
+        write(tmp_path / name, signals[name], subtype=subtype)
+    done = rosafe("process", *kinds, *SMALL, "--outputs", "input,ild", cwd=tmp_path)
+    assert done.returncode == 0, done
+    for name, (_, bits) in kinds.items():
+        samples = as_int32(signals[name])
+        assert np.all(samples % 2 ** (32 - bits) == 0)
+        expected = process(samples, 16000, parameters=SMALL_PARAMETERS, outputs=["input", "ild"])
+        assert_equal((tmp_path / name).with_suffix(".npz"), expected)
+
+
+def test_extensible_header(tmp_path: Path) -> None:
+    """WAVE_FORMAT_EXTENSIBLE, as many programs write it."""
+    signal = np.random.default_rng(9).integers(-128, 128, (2, 5000)) / 128
+    subtypes = ("PCM_U8", "PCM_24", "FLOAT", "DOUBLE")
+    names = []
+    for subtype in subtypes:
+        for form in ("WAV", "WAVEX"):
+            names.append(f"{subtype}-{form}.wav")
+            soundfile.write(tmp_path / names[-1], signal.T, 16000, subtype, format=form)
+    assert rosafe("process", *names, *SMALL, "--outputs", "input", cwd=tmp_path).returncode == 0
+    for subtype in subtypes:
+        with (
+            np.load(tmp_path / f"{subtype}-WAV.npz") as plain,
+            np.load(tmp_path / f"{subtype}-WAVEX.npz") as extensible,
+        ):
+            np.testing.assert_array_equal(plain["input"], extensible["input"])
+
+
+def test_float_files(tmp_path: Path) -> None:
+    """Samples beyond full scale are clipped, and NaN becomes silence."""
+    signal = np.random.default_rng(5).normal(0, 0.3, (2, 5000)).astype(np.float32).astype(np.float64)
+    signal[:, 7] = 1.5, -1.5
+    signal[:, 8] = np.nan, np.inf
+    subtypes = ("FLOAT", "DOUBLE")
+    for subtype in subtypes:
+        write(tmp_path / f"{subtype}.wav", signal, subtype=subtype)
+    names = [f"{subtype}.wav" for subtype in subtypes]
+    assert rosafe("process", *names, *SMALL, "--outputs", "input,ratemap", cwd=tmp_path).returncode == 0
+    signal[:, 8] = 0.0, 1.0
+    samples = np.rint(np.clip(signal * (2**31 - 1), -(2**31), 2**31 - 1)).astype(np.int32)
+    expected = process(samples, 16000, parameters=SMALL_PARAMETERS, outputs=["input", "ratemap"])
+    for subtype in subtypes:
+        assert_equal(tmp_path / f"{subtype}.npz", expected)
+
+
+def test_everything_at_any_rate_with_defaults(tmp_path: Path) -> None:
+    signals = {}
+    for rate in (22050, 44100, 96000):
+        signals[rate] = np.random.default_rng(rate).integers(-(2**31), 2**31, (2, 13000)).astype(np.int32)
+        write(tmp_path / f"{rate}.wav", signals[rate], rate, "PCM_32")
+    done = rosafe("process", *(f"{rate}.wav" for rate in signals), *SEVEN, cwd=tmp_path)
+    assert done.returncode == 0, done
+    for rate, samples in signals.items():
+        expected = process(samples, rate)
+        assert set(CORE_REPRESENTATIONS) < set(expected)
+        assert_equal(tmp_path / f"{rate}.npz", expected)
+        with np.load(tmp_path / f"{rate}.npz") as loaded:
+            assert loaded["sample_rate"] == rate
+            assert loaded["block_frames"] == 12000
+
+
+def test_settings_and_blocks(tmp_path: Path) -> None:
+    samples = np.random.default_rng(3).integers(-(2**30), 2**30, (2, 20000)).astype(np.int32)
+    path = write(tmp_path / "in.wav", samples, 16000, "PCM_32")
+    settings = ["pp_bNormalizeRMS=true", "fb_cfHz=500,1000", "ihc_method=bernstein", "rm_wname=hamming"]
+    # gain control starts with the first block, so this comparison fails for other block lengths
+    done = rosafe("process", path, "--block", "1777", "--set", *settings, "--set", "in_doNormalize=0", *SEVEN)
+    assert done.returncode == 0, done
+    parameters = {
+        "pp_bNormalizeRMS": True,
+        "fb_cfHz": [500.0, 1000.0],
+        "ihc_method": "bernstein",
+        "rm_wname": "hamming",
+        "in_doNormalize": False,
+    }
+    expected = process(samples, 16000, parameters=parameters, block_frames=1777)
+    other = process(samples, 16000, parameters=parameters, block_frames=1600)
+    assert not np.array_equal(expected["preProc"], other["preProc"])
+    assert_equal(tmp_path / "in.npz", expected)
+    with np.load(tmp_path / "in.npz") as loaded:
+        effective = json.loads(str(loaded["parameters"]))
+        assert loaded["block_frames"] == 1777
+    every = {p.name for kind in KINDS.values() for p in kind.parameters}
+    assert set(effective) == every - {"ams_highFreqHz"}  # follows the sample rate, and is not computed
+    assert parameters.items() <= effective.items()
+    again = process(samples, 16000, parameters=effective, block_frames=1777)
+    for name, value in expected.items():
+        np.testing.assert_array_equal(again[name], value)
+
+
+def test_framed_outputs_are_the_default_and_are_named(tmp_path: Path) -> None:
+    path = write(tmp_path / "in.wav", noise(4000))
+    done = rosafe("process", path, *SMALL)
+    assert done.returncode == 0 and "; ild, ratemap, crossCorrelation (see --outputs)\n" in done.stderr
+    expected = process(as_int32(noise(4000)), 16000, parameters=SMALL_PARAMETERS, outputs=FRAMES)
+    assert_equal(tmp_path / "in.npz", expected)
+
+
+def test_unneeded_outputs_are_absent(tmp_path: Path) -> None:
+    path = write(tmp_path / "in.wav", noise(4000))
+    assert rosafe("process", path, "--outputs", "preProc").returncode == 0
+    assert set(load(tmp_path / "in.npz")) == {"preProc", "preProc_time", *BESIDES}
+
+
+def test_short_files(tmp_path: Path) -> None:
+    """Shorter than a window (of 320 frames), exactly one window, a fractional number of hops, exactly one block."""
+    signals = {}
+    for frames in (1, 100, 319, 320, 481, 12000, 12001):
+        signals[frames] = np.random.default_rng(frames).integers(-(2**31), 2**31, (2, frames)).astype(np.int32)
+        write(tmp_path / f"{frames}.wav", signals[frames], subtype="PCM_32")
+    assert rosafe("process", *(f"{frames}.wav" for frames in signals), *SMALL, *SEVEN, cwd=tmp_path).returncode == 0
+    for frames, samples in signals.items():
+        assert_equal(tmp_path / f"{frames}.npz", process(samples, 16000, parameters=SMALL_PARAMETERS))
+
+
+@pytest.mark.parametrize("settings", [["ild_hSizeSec=0.05"], ["cc_hSizeSec=0.0123", "cc_maxDelaySec=0.03"]])
+def test_frames_that_do_not_overlap_or_divide(tmp_path: Path, settings: list[str]) -> None:
+    samples = np.random.default_rng(8).integers(-(2**31), 2**31, (2, 9999)).astype(np.int32)
+    path = write(tmp_path / "in.wav", samples, subtype="PCM_32")
+    done = rosafe("process", path, "--block", "700", *SMALL, *settings, *SEVEN)
+    assert done.returncode == 0, done
+    changes = {name: float(value) for name, value in (setting.split("=") for setting in settings)}
+    parameters: dict[str, Any] = {**SMALL_PARAMETERS, **changes}
+    assert_equal(tmp_path / "in.npz", process(samples, 16000, parameters=parameters, block_frames=700))
+
+
+def test_the_recordings(tmp_path: Path) -> None:
+    names = ["speech_anechoic_16k.wav", "speech_room_16k.wav"]
+    paths = [shared("audio", name) for name in names]
+    done = rosafe("process", *paths, "--outputs", "ild,crossCorrelation", "-o", f"{tmp_path}/")
+    assert done.returncode == 0, done
+    for path in paths:
+        samples, rate = soundfile.read(path, dtype="int32")
+        expected = process(np.ascontiguousarray(samples.T), rate, outputs=["ild", "crossCorrelation"])
+        assert_equal(tmp_path / f"{path.stem}.npz", expected)
+
+
+# --- several files and the paths of their results ---
+
+
+@pytest.mark.parametrize("jobs", ["1", "2", "5"])
+def test_several_files(tmp_path: Path, jobs: str) -> None:
+    signals = {f"{n}.wav": noise(3000 + 500 * n, seed=n) for n in range(5)}
+    for name, signal in signals.items():
+        write(tmp_path / name, signal)
+    done = rosafe("process", *signals, "--jobs", jobs, *SMALL, "--outputs", "ild", cwd=tmp_path)
+    assert done.returncode == 0, done
+    assert done.stdout == ""
+    assert done.stderr.startswith("5 files: 5 done; 1.2 s of sound, ") and done.stderr.count("\n") == 1
+    for name, signal in signals.items():
+        expected = process(as_int32(signal), 16000, parameters=SMALL_PARAMETERS, outputs=["ild"])
+        assert_equal((tmp_path / name).with_suffix(".npz"), expected)
+    assert len(list(tmp_path.iterdir())) == 10
+
+
+def test_the_others_are_processed_after_a_faulty_file(tmp_path: Path) -> None:
+    write(tmp_path / "a.wav", noise(3000))
+    write(tmp_path / "b.wav", noise(3000)[:1])
+    write(tmp_path / "c.wav", noise(3000))
+    done = rosafe("process", "a.wav", "b.wav", "c.wav", "-q", *SMALL, cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.startswith(
+        "rosafe process: b.wav: expected two channels, left and right ear, got 1 (the file is mono)"
+    )
+    assert done.stderr.count("\n") == 1
+    assert {path.name for path in tmp_path.glob("*.npz")} == {"a.npz", "c.npz"}
+
+
+def test_input_files_may_follow_settings_and_quiet_is_quiet(tmp_path: Path) -> None:
+    write(tmp_path / "a.wav", noise(3000))
+    done = rosafe("process", "--quiet", *SMALL, "a.wav", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (tmp_path / "a.npz").exists()
+
+
+def test_an_output_that_is_named_is_replaced(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.wav", noise(3000))
+    old, out = tmp_path / "old", tmp_path / "out.npz"
+    old.write_text("something")
+    out.symlink_to(old)
+    assert rosafe("process", path, *SMALL, "-o", out).returncode == 0
+    assert out.is_symlink()
+    with np.load(old) as loaded:
+        assert "ild" in loaded
+
+
+def test_outputs_in_a_folder(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.b.wav", noise(3000))
+    (tmp_path / "results").mkdir()
+    assert rosafe("process", path, *SMALL, "-o", tmp_path / "results").returncode == 0
+    assert [path.name for path in (tmp_path / "results").iterdir()] == ["a.b.npz"]
+
+
+def test_outputs_in_a_new_folder(tmp_path: Path) -> None:
+    """As in `rosafe process *.wav -o results/`."""
+    write(tmp_path / "a.wav", noise(3000))
+    write(tmp_path / "mono.wav", noise(3000)[:1])
+    assert rosafe("process", "a.wav", "mono.wav", *SMALL, "-o", "results/", cwd=tmp_path).returncode == 1
+    assert {path.name for path in (tmp_path / "results").iterdir()} == {"a.npz", "failed.csv"}
+    assert rosafe("process", "mono.wav", *SMALL, "-o", "others/", cwd=tmp_path).returncode == 1
+    assert [path.name for path in (tmp_path / "others").iterdir()] == ["failed.csv"]
+    done = rosafe("process", "a.wav", *SMALL, "-o", "deep/er/", cwd=tmp_path)
+    assert done.returncode == 0 and (tmp_path / "deep" / "er" / "a.npz").exists(), done
+
+
+def test_same_input_same_file(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.wav", noise(3000))
+    for name in ("x.npz", "y.npz"):
+        assert rosafe("process", path, *SMALL, "-o", tmp_path / name).returncode == 0
+    assert (tmp_path / "x.npz").read_bytes() == (tmp_path / "y.npz").read_bytes()
+    assert (tmp_path / "x.npz").stat().st_mode & 0o777 == 0o666 & ~_umask()
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

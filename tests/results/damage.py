@@ -1,0 +1,170 @@
+"""Damaged results: copies with seeded changes, read by a forked child process, which starts quickly."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rosafe.results import containers, isolated
+
+_TOKENS = [
+    "[" * 5000,
+    "{}",
+    "[]",
+    "null",
+    "NaN",
+    "1e999",
+    "-1",
+    "0",
+    '"x"',
+    "true",
+    "9" * 400,
+    '{"a": [[1]]}',
+    "\\u0000",
+]
+_NUMBERS = [0, 1, 2, 127, 128, 255, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**48, 2**63 - 1, 2**63, 2**64 - 1]
+
+_WORDS = [b"OHDR", b"TREE", b"SNOD", b"HEAP", b"GCOL", b"NUMPY", b"PK", b"{", b'"', b"\x0e\0\0\0", b"I\0M\0"]
+_WORDS += [b"axes", b"shape", b"sample_rate", b"frameRate", b"ild"]
+
+
+class Forked:
+    """Replaces `subprocess.Popen` for `rosafe.results.isolated` without the start of an interpreter."""
+
+    def __init__(self, args: list[str], **options: Any) -> None:
+        self.args = args
+        self.returncode = 0
+        (read, write), (read_error, write_error), (asked, ask) = os.pipe(), os.pipe(), os.pipe()
+        self._child = os.fork()
+        if not self._child:
+            for number, descriptor in enumerate((asked, write, write_error)):
+                os.dup2(descriptor, number)
+            for number in {*range(3, 200)} - {*options["pass_fds"]}:
+                with contextlib.suppress(OSError):
+                    os.close(number)
+            sys.stdin = open(0)  # noqa: SIM115
+            sys.argv = args[args.index(containers._PROGRAM) :]
+            status = 1
+            try:
+                isolated.main()
+                status = 0
+            except SystemExit as end:
+                os.write(2, f"{end.code}\n".encode())
+            finally:
+                os._exit(status)
+        os.close(write)
+        os.close(write_error)
+        os.close(asked)
+        self.stdin = open(ask, "wb", buffering=0)  # noqa: SIM115
+        self.stdout = open(read, "rb", buffering=0)  # noqa: SIM115
+        self._error = open(read_error, "rb")  # noqa: SIM115
+
+    def __enter__(self) -> Forked:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._wait()
+        self.stdin.close()
+        self.stdout.close()
+        self._error.close()
+
+    def _wait(self) -> None:
+        if self._child:
+            self.returncode = os.waitstatus_to_exitcode(os.waitpid(self._child, 0)[1])
+            self._child = 0
+
+    def kill(self) -> None:
+        if self._child:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._child, signal.SIGKILL)
+
+    def communicate(self, timeout: float) -> tuple[bytes, bytes]:
+        text = self._error.read()
+        self._wait()
+        return b"", text
+
+
+@pytest.fixture
+def forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Child processes that read are forked."""
+    monkeypatch.setattr(containers, "subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": Forked}))
+
+
+def change(content: bytes, draw: random.Random) -> bytes:
+    """Return a copy with one to four changes of bytes, lengths, numbers or texts."""
+    data = bytearray(content)
+    for _ in range(draw.choice((1, 1, 1, 2, 4))):
+        at = draw.randrange(max(1, len(data)))
+        if draw.random() < 0.5:  # most of a file are array elements, for which any value is valid
+            at = draw.choice(_interesting(bytes(data))) if data else 0
+        way = draw.randrange(8)
+        if way == 0:
+            data[at : at + 1] = bytes([draw.randrange(256)])
+        elif way == 1:
+            data[at : at + 1] = bytes([(data[at] if at < len(data) else 0) ^ (1 << draw.randrange(8))])
+        elif way == 2:
+            width = draw.choice((1, 2, 4, 8))
+            data[at : at + width] = (draw.choice(_NUMBERS) % 256**width).to_bytes(width, "little")
+        elif way == 3:
+            del data[at : at + draw.choice((1, 4, 8, 100, 10**9))]
+        elif way == 4:
+            data[at:at] = bytes(draw.choices(range(256), k=draw.choice((1, 4, 8, 100))))
+        elif way == 5:
+            data[at : at + draw.choice((4, 8, 16, 64))] = draw.choice((b"\0", b"\xff")) * 16
+        elif way == 6:
+            other = draw.randrange(max(1, len(data)))
+            data[at : at + 16] = data[other : other + 16]
+        else:
+            data[at : at + draw.choice((0, 1, 3))] = draw.choice(_TOKENS).encode()
+    return bytes(data)
+
+
+def _interesting(content: bytes) -> range | list[int]:
+    """Return offsets near texts and signatures."""
+    found = [at for word in _WORDS for at in _all(content, word)]
+    return [min(len(content) - 1, at + step) for at in found for step in range(0, 40, 3)] or range(len(content))
+
+
+def _all(content: bytes, word: bytes) -> Iterator[int]:
+    at = content.find(word)
+    while at >= 0:
+        yield at
+        at = content.find(word, at + 1)
+
+
+def damaged(good: Path, target: Path, seed: int) -> Path:
+    """Create a changed copy of a file, or of a folder with one changed file, as `target`."""
+    draw = random.Random(seed)
+    if good.is_dir():
+        shutil.rmtree(target, ignore_errors=True)
+        shutil.copytree(good, target)
+        files = sorted(path for path in target.rglob("*") if path.is_file())
+        heads = [path for path in files if path.name.startswith(".z")]
+        changed = draw.choice(heads if draw.random() < 0.7 else files)
+        changed.write_bytes(change(changed.read_bytes(), draw))
+    elif good.suffix == ".npz" and draw.random() < 0.7:  # with the right checksums
+        with zipfile.ZipFile(good) as old, zipfile.ZipFile(target, "w", draw.choice((0, 8))) as new:
+            changed_name = draw.choice(old.namelist())
+            for name in old.namelist():
+                content = old.read(name)
+                new.writestr(name, change(content, draw) if name == changed_name else content)
+    else:
+        target.write_bytes(change(good.read_bytes(), draw))
+    return target
+
+
+VALUES: list[Any] = [None, True, -1, 0, 0.5, 1e308, 10**400, float("nan"), float("inf"), "", "x", "\ud800"]
+VALUES += [[], [1, "a"], {}, [[]], {"ild": 5}, {"ild": [5]}, {"ild": ["channel"]}, {"ild": "time"}, {"ild": {"a": 1}}]
+VALUES += [{"\x1b[31m": ["time"]}]

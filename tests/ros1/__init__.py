@@ -1,0 +1,1 @@
+"""Tests of the ROS 1 nodes and their clients."""

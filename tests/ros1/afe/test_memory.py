@@ -1,0 +1,59 @@
+"""The settings of the C library's allocator are accepted, and a process releases unused memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.harness import PYTHON, ROOT, Graph, proc
+from tests.plugins.stages import PLAIN, Fault, text_of
+from tests.ros1.afe.session import Session, noise
+from tests.ros1.afe.test_faults import threads_and_memory
+
+# Allocates memory of all sizes in many threads, frees almost all, and prints the resident MiB.
+SPREAD = """
+import random, threading
+from rosafe.ros1.component import malloc_tuning
+malloc_tuning.limit_arenas()
+def resident():
+    return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) // 1024
+kept, before = [], resident()
+def work(seed):
+    chance = random.Random(seed)
+    pieces = [bytes(chance.randrange(1000, 300_000)) for _ in range(300)]
+    kept.extend(pieces[::100])
+threads = [threading.Thread(target=work, args=(seed,)) for seed in range(12)]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+malloc_tuning.trim()
+print(resident() - before)
+"""
+
+
+def test_freed_memory_is_returned_to_the_system(graph: Graph) -> None:
+    proc()
+    done = graph.run(PYTHON, "-c", SPREAD, PYTHONPATH=str(ROOT))
+    assert int(done.stdout) < 60, "of some 500 MiB"
+
+
+def test_removed_processors_are_freed_without_garbage_collection(graph: Graph, tmp_path: Path) -> None:
+    """They have tens of MB each, and Python looks for reference cycles only after very many allocations."""
+    frames = 20_000
+    (tmp_path / "uncollected.py").write_text(f"{text_of(Fault(PLAIN, '', ''))}\nimport gc\ngc.disable()\n")
+    with graph.node("rosAFE-ros", "-i", "uncollected", ROSAFE_PLUGINS=str(tmp_path)) as process:
+        session = Session(graph, process, "uncollected")
+        microphone = session.build("PreProc", block=frames // 4)
+
+        def cycle() -> None:
+            session.ok("GammatoneProc", fb_nChannels=64)
+            session.ok("IhcProc")
+            microphone.play(noise(frames))
+            session.read("ihc", microphone.index + 1)
+            session.ok("removeProcessor", name="gammatone")
+
+        cycle()
+        _, before = threads_and_memory(process.pid)
+        for _ in range(10):
+            cycle()
+        _, after = threads_and_memory(process.pid)
+        session.close()
+        assert (after - before) / 2**20 < 150, "of some 400 MiB"

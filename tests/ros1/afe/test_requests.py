@@ -1,0 +1,473 @@
+"""Requests as plain services: order of checks, rejected requests change nothing, defaults, removal."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import rospy
+
+from rosafe import process
+from rosafe.interface import CORE_REPRESENTATIONS, ROSAFE
+from tests import harness
+from tests.harness import wait_for
+from tests.ros1.afe.session import RATE, Session, noise, own_node
+
+CHAIN = ("PreProc", "GammatoneProc", "IhcProc", "IldProc", "RatemapProc", "CrossCorrelationProc")
+NAMES = {kind: [ROSAFE.service(k.request).parameter("name").default] for kind, k in CORE_REPRESENTATIONS.items()}
+
+
+def snapshot(afe: Session) -> tuple[Any, set[str]]:
+    """Return the state that a rejected request must not change."""
+    return afe.ok("getParameters").parameters, {t for t in afe.graph.topics() if re.match(f"/{afe.name}/\\w+Port", t)}
+
+
+# --- InputProc --------------------------------------------------------------------------------------------------
+
+
+def test_input_without_a_connection_is_an_error(graph: harness.Graph) -> None:
+    with own_node(graph) as afe:
+        assert afe.refused("InputProc") == ("::rosAFE::e_noData", {})
+        assert "connect_port" in afe.process.err, "the log contains the next step"
+
+
+def test_input_waits_for_a_first_message(afe: Session) -> None:
+    topic = rospy.Publisher("/silent/Audio", _audio_class(), queue_size=1)
+    afe.ok("connect_port", local="Audio", remote="silent/Audio")
+    assert afe.refused("InputProc") == ("::rosAFE::e_noData", {})
+    assert afe.processors() == {}
+    wait_for(lambda: topic.get_num_connections() == 1)
+    goal = afe.goal("InputProc")
+    afe.wait_activities(["InputProc"])
+    topic.publish(_audio_class()(sampleRate=RATE, nChunksOnPort=1, nFramesPerChunk=2, left=[0, 0], right=[0, 0]))
+    goal.active()
+    assert afe.processors() == {"input": ["input"]}
+    assert goal.running
+    topic.unregister()
+
+
+def _audio_class() -> Any:
+    import bass.msg
+
+    return bass.msg.binaudio_portStruct
+
+
+def test_a_second_input_replaces_the_first_and_keeps_the_tree(afe: Session) -> None:
+    microphone = afe.build("PreProc", block=800)
+    first = noise(800, 1)
+    microphone.play(first)
+    afe.read("preProc", 801)
+    ids = afe.wait_activities(["InputProc", "PreProc"])
+    afe.ok("InputProc", name="other", nFramesPerBlock=400)
+    assert afe.processors() == {"input": ["other"], "preProc": ["preProc"]}
+    later = afe.wait_activities(["InputProc", "PreProc"])
+    assert len(set(ids) & set(later)) == 1, "the pre-processor continues, the old input has ended"
+    second = noise(400, 2)
+    microphone.play(second)
+    message = afe.read("preProc", 1201)
+    assert list(message.left[-400:]) == list(second[0] / (2**31 - 1))
+    assert afe.ok("getDependencies", nameProc="preProc").dependencies == ["other", "preProc"]
+
+
+def test_an_input_cannot_take_the_name_of_another_processor(afe: Session) -> None:
+    afe.build("PreProc")
+    before = snapshot(afe)
+    assert afe.refused("InputProc", name="preProc") == ("::rosAFE::e_existsAlready", {})
+    assert snapshot(afe) == before
+
+
+def test_a_rejected_second_input_does_not_affect_the_first(afe: Session) -> None:
+    microphone = afe.build(block=800)
+    ex, detail = afe.refused("InputProc", bufferSize_s_port=math.nan)
+    assert ex == "::rosAFE::e_badNewValue" and "bufferSize_s_port" in detail["what"]
+    afe.listen(sample_rate=2 * RATE)
+    afe.ok("PreProc")
+    ex, detail = afe.refused("InputProc")
+    assert ex == "::rosAFE::e_badNewValue" and str(2 * RATE) in detail["what"] and "Stop" in detail["what"]
+    assert afe.processors() == {"input": ["input"], "preProc": ["preProc"]}
+    assert microphone.topic != afe.topic("input")
+
+
+# --- other requests: order of checks --------------------------------------------------------------------------
+
+
+def test_the_order_of_checks(afe: Session) -> None:
+    """Unknown parent, used name, parent of another kind, values: the first one that applies is reported."""
+    afe.build("PreProc", "GammatoneProc", "IhcProc", fb_nChannels=2)
+    before = snapshot(afe)
+    for request_name in CHAIN:
+        wrong = {"PreProc": "preProc", "GammatoneProc": "input"}.get(request_name, "preProc")
+        bad: Mapping[str, Any] = {
+            p.name: math.nan for p in ROSAFE.service(request_name).parameters if p.idl == "double"
+        }
+        missing, taken, free = "nobody", "ihc", "fresh"
+        for name, parent, ex in (
+            (free, missing, "e_noUpperDependencie"),
+            (taken, missing, "e_noUpperDependencie"),
+            (taken, wrong, "e_existsAlready"),
+            (free, wrong, "e_noUpperDependencie"),
+            ("INPUT", "Input", "e_noUpperDependencie"),  # names are case-sensitive
+        ):
+            given = {"name": name, "upperDepName": parent, **bad}
+            assert afe.refused(request_name, **given) == (f"::rosAFE::{ex}", {}), (request_name, given)
+    assert snapshot(afe) == before
+
+
+OUT_OF_RANGE: tuple[tuple[str, dict[str, Any], str], ...] = (
+    ("PreProc", {"pp_cutoffHzDC": math.nan}, "pp_cutoffHzDC"),
+    ("PreProc", {"pp_bRemoveDC": True, "pp_cutoffHzDC": RATE / 2}, "pp_cutoffHzDC"),
+    ("PreProc", {"pp_intTimeSecRMS": -1.0}, "pp_intTimeSecRMS"),
+    ("PreProc", {"pp_coefPreEmphasis": 1.5}, "pp_coefPreEmphasis"),
+    ("PreProc", {"pp_refSPLdB": math.inf}, "pp_refSPLdB"),
+    ("PreProc", {"name": "white space"}, "name"),
+    ("PreProc", {"name": "umlaut_ä"}, "name"),
+    ("PreProc", {"name": "a//b"}, "name"),
+    ("PreProc", {"name": "x" * 5000}, "name"),
+    ("GammatoneProc", {"fb_highFreqHz": float(RATE)}, "fb_highFreqHz"),
+    ("GammatoneProc", {"fb_lowFreqHz": 3000.0, "fb_highFreqHz": 2000.0}, "fb_"),
+    ("GammatoneProc", {"fb_nERBs": -1.0}, "fb_nERBs"),
+    ("GammatoneProc", {"fb_nERBs": 1e-12}, "fb_nERBs"),
+    ("GammatoneProc", {"fb_nChannels": 2**32 - 1}, "fb_nChannels"),
+    ("GammatoneProc", {"fb_nGamma": 10**6}, "fb_nGamma"),
+    ("GammatoneProc", {"fb_cfHz": [100.0, math.nan]}, "fb_cfHz"),
+    ("GammatoneProc", {"fb_cfHz": [100.0, RATE * 1.0]}, "fb_cfHz"),
+    ("GammatoneProc", {"fb_cfHz": [100.0] * 5000}, "fb_cfHz"),
+    ("IldProc", {"ild_wSizeSec": -0.02}, "ild_wSizeSec"),
+    ("IldProc", {"ild_hSizeSec": 1e-9}, "ild_hSizeSec"),
+    ("IldProc", {"ild_hSizeSec": 1e300}, "ild_hSizeSec"),
+    ("RatemapProc", {"rm_decaySec": -math.inf}, "rm_decaySec"),
+    ("RatemapProc", {"rm_wSizeSec": 1e6}, "rm_wSizeSec"),
+    ("CrossCorrelationProc", {"cc_maxDelaySec": -0.001}, "cc_maxDelaySec"),
+    ("CrossCorrelationProc", {"cc_maxDelaySec": 9.9, "cc_hSizeSec": 0.0001}, "port or history"),
+    ("InputProc", {"bufferSize_s_port": -1.0}, "bufferSize_s_port"),
+    ("InputProc", {"bufferSize_s_port": 1e9}, "bufferSize_s_port"),
+    ("InputProc", {"bufferSize_s_getSignal": math.nan}, "bufferSize_s_getSignal"),
+    ("InputProc", {"nFramesPerBlock": 2**32 - 1}, "nFramesPerBlock"),
+)
+
+
+def test_values_out_of_range_are_rejected_with_the_reason(afe: Session) -> None:
+    afe.build("PreProc", "GammatoneProc", "IhcProc", fb_nChannels=2)
+    before = snapshot(afe)
+    for request_name, values, named in OUT_OF_RANGE:
+        ex, detail = afe.refused(request_name, **{"name": "fresh", **values})
+        assert ex == "::rosAFE::e_badNewValue", (request_name, values)
+        assert list(detail) == ["what"] and named in detail["what"] and "\n" not in detail["what"], (detail, values)
+        assert snapshot(afe) == before, (request_name, values)
+
+
+# --- defaults ---------------------------------------------------------------------------------------------------
+
+
+def test_zeros_are_defaults(afe: Session) -> None:
+    """ROS requests have no defaults: zeros stand for the defaults."""
+    afe.listen()
+    for request in ("InputProc", *CHAIN):
+        afe.ok(request)
+    assert afe.processors() == NAMES
+    parameters = afe.ok("getParameters").parameters
+    for kind, table in CORE_REPRESENTATIONS.items():
+        (struct,) = getattr(parameters, kind)
+        for parameter in table.parameters:
+            if parameter.name not in ("fb_cfHz", "fb_nChannels"):
+                assert getattr(struct, parameter.name) == parameter.default, parameter.name
+    assert parameters.gammatone[0].fb_nChannels == 31
+
+
+def test_unknown_choices_are_replaced(afe: Session) -> None:
+    afe.build(
+        "PreProc",
+        "GammatoneProc",
+        "IhcProc",
+        "IldProc",
+        "RatemapProc",
+        fb_nChannels=2,
+        pp_middleEarModel="jespen",
+        fb_type="string",
+        ihc_method="whatever",
+        ild_wname="boxcar",
+        rm_scaling="loud",
+    )
+    parameters = afe.ok("getParameters").parameters
+    assert parameters.preProc[0].pp_middleEarModel == "jepsen"
+    assert parameters.gammatone[0].fb_type == "gammatone"
+    assert parameters.ihc[0].ihc_method == "dau"
+    assert parameters.ild[0].ild_wname == "hann"
+    assert parameters.ratemap[0].rm_scaling == "power"
+
+
+def test_a_window_too_short_for_the_pitch_range_is_logged_once(afe: Session) -> None:
+    line = "pitch: pi_rangeHz, ac_wSizeSec: a window of 0.02 s contains fewer than 3 periods of 80 Hz"
+    before = afe.process.err.count(line)
+    afe.build("PreProc", "GammatoneProc", "IhcProc", "AutocorrelationProc", "PitchProc", fb_nChannels=2)
+    wait_for(lambda: afe.process.err.count(line) == before + 1, what=lambda: afe.process.err)
+    afe.ok("modifyParameter", nameProc="pitch", nameParam="pi_medianOrder", newValue="5")
+    afe.ok("AutocorrelationProc", name="long", upperDepName="ihc", ac_wSizeSec=0.04)
+    afe.ok("PitchProc", name="voices", upperDepName="long")
+    assert afe.process.err.count("pi_rangeHz, ac_wSizeSec") == before + 1
+
+
+def test_a_list_of_one_zero_is_the_default(afe: Session) -> None:
+    afe.build("PreProc")
+    afe.ok("GammatoneProc", fb_cfHz=[0.0], fb_nChannels=3)
+    assert afe.ok("getParameters").parameters.gammatone[0].fb_nChannels == 3
+
+
+def test_parameters_are_returned_exactly(afe: Session) -> None:
+    afe.build("PreProc")
+    given: dict[str, dict[str, Any]] = {
+        "PreProc": {
+            "pp_bRemoveDC": True,
+            "pp_cutoffHzDC": 20.000000000000004,
+            "pp_bPreEmphasis": True,
+            "pp_coefPreEmphasis": 0.1 + 0.2,
+            "pp_bNormalizeRMS": True,
+            "pp_intTimeSecRMS": 1 / 3,
+            "pp_bLevelScaling": True,
+            "pp_refSPLdB": -math.pi,
+            "pp_bMiddleEarFiltering": True,
+            "pp_middleEarModel": "lopezpoveda",
+            "pp_bUnityComp": True,
+        },
+        "GammatoneProc": {"fb_cfHz": [100.1, 1000 / 3, 5e3], "fb_nGamma": 3, "fb_bwERBs": 1.0179999999999998},
+        "IhcProc": {"ihc_method": "dau1996"},
+        "IldProc": {"ild_wname": "blackman", "ild_wSizeSec": 0.02 + 1e-17, "ild_hSizeSec": 0.1 / 7},
+        "RatemapProc": {"rm_wname": "hamming", "rm_scaling": "magnitude", "rm_decaySec": 0.1 / 3, "rm_wSizeSec": 0.03},
+        "CrossCorrelationProc": {"cc_maxDelaySec": 0.0011, "cc_wname": "triang", "cc_hSizeSec": 0.005},
+    }
+    parent = "input"
+    for request, values in given.items():
+        afe.ok(request, name=f"my_{request}", upperDepName=parent, **values)
+        if request in ("PreProc", "GammatoneProc", "IhcProc"):
+            parent = f"my_{request}"
+    parameters = afe.ok("getParameters").parameters
+    assert [p.name for p in parameters.preProc] == ["preProc", "my_PreProc"], "in the order of creation"
+    for kind, table in CORE_REPRESENTATIONS.items():
+        if table.parent:
+            struct = getattr(parameters, kind)[-1]
+            assert struct.name == f"my_{table.request}"
+            for name, value in given[table.request].items():
+                got = getattr(struct, name)
+                assert (list(got) if isinstance(value, list) else got) == value, name
+    flat = {name: value for values in given.values() for name, value in values.items()}
+    truth = process(noise(2000), RATE, parameters=flat)
+    assert list(parameters.gammatone[0].fb_cfHz) == list(truth["fb_cfHz"])
+    assert parameters.gammatone[0].fb_nChannels == 3
+    assert list(parameters.crossCorrelation[0].cc_lags) == list(truth["cc_lags"])
+    (reported_input,) = parameters.input
+    assert (reported_input.name, reported_input.in_doNormalize, reported_input.in_normalizeValue) == (
+        "input",
+        True,
+        2**31 - 1,
+    )
+
+
+# --- dependencies, modification, removal ------------------------------------------------------------------------
+
+
+def test_dependencies_start_at_the_root(afe: Session) -> None:
+    afe.build(*CHAIN, fb_nChannels=2)
+    for name, expected in (
+        ("input", ["input"]),
+        ("ihc", ["input", "preProc", "gammatone", "ihc"]),
+        ("ratemap", ["input", "preProc", "gammatone", "ihc", "ratemap"]),
+        ("crosscorrelation", ["input", "preProc", "gammatone", "ihc", "crosscorrelation"]),
+    ):
+        assert afe.ok("getDependencies", nameProc=name).dependencies == expected
+    for name in ("nobody", "", "IHC", "nameProc", "ï" * 300):
+        assert afe.refused("getDependencies", nameProc=name) == ("::rosAFE::e_noSuchProcessor", {})
+
+
+MODIFICATIONS: tuple[tuple[str, str, str, Any], ...] = (
+    ("input", "in_doNormalize", "0", False),
+    ("input", "in_doNormalize", " true ", True),
+    ("input", "in_normalizeValue", "18446744073709551615", 2**64 - 1),
+    ("preProc", "pp_refSPLdBS", "-3.5e1", -35.0),
+    ("preProc", "pp_refSPLdB", "0", 0.0),
+    ("preProc", "pp_middleEarModel", "jespen", "jepsen"),
+    ("gammatone", "fb_nGamma", "3", 3),
+    ("gammatone", "fb_bwERBs", "20E-1", 2.0),
+    ("ihc", "ihc_method", "dau1996", "dau1996"),
+    ("ihc", "ihc_method", "unheard of", "dau"),
+    ("ild", "ild_wname", "hamming", "hamming"),
+    ("ratemap", "set_rm_scailing", "_magnitude", "magnitude"),
+    ("ratemap", "rm_decaySec", ".02", 0.02),
+    ("crosscorrelation", "cc_maxDelaySec", "0.0005", 0.0005),
+)
+
+
+def test_modify_parameter(afe: Session) -> None:
+    afe.build(*CHAIN, fb_nChannels=2)
+    for name, parameter, text, value in MODIFICATIONS:
+        afe.ok("modifyParameter", nameProc=name, nameParam=parameter, newValue=text)
+        parameters = afe.ok("getParameters").parameters
+        struct = {p.name: p for kind in CORE_REPRESENTATIONS for p in getattr(parameters, kind)}[name]
+        real = {"pp_refSPLdBS": "pp_refSPLdB", "set_rm_scailing": "rm_scaling"}.get(parameter, parameter)
+        assert getattr(struct, real) == value, (parameter, text)
+        if parameter == "cc_maxDelaySec":
+            assert len(struct.cc_lags) == 2 * math.ceil(0.0005 * RATE) + 1
+
+
+REJECTED = (
+    ("nobody", "nothing", "none", "e_noSuchProcessor"),
+    ("", "", "", "e_noSuchProcessor"),
+    ("input", "pp_bRemoveDC", "1", "e_noSuchParameter"),  # the guide's own example
+    ("preProc", "pp_nothing", "", "e_noSuchParameter"),
+    ("input", "in_doNormalize", "2", "e_badNewValue"),
+    ("input", "in_doNormalize", "TRUE", "e_badNewValue"),
+    ("input", "in_doNormalize", "", "e_badNewValue"),
+    ("input", "in_normalizeValue", "0", "e_badNewValue"),
+    ("input", "in_normalizeValue", "5.0", "e_badNewValue"),
+    ("input", "in_normalizeValue", "-1", "e_badNewValue"),
+    ("input", "in_normalizeValue", "18446744073709551616", "e_badNewValue"),
+    ("input", "in_normalizeValue", "9" * 4000, "e_badNewValue"),
+    ("preProc", "pp_refSPLdB", "nan", "e_badNewValue"),
+    ("preProc", "pp_refSPLdB", "1e999", "e_badNewValue"),
+    ("preProc", "pp_refSPLdB", "0x10", "e_badNewValue"),
+    ("preProc", "pp_refSPLdB", "1,5", "e_badNewValue"),
+    ("preProc", "pp_refSPLdB", "12abc", "e_badNewValue"),
+    ("preProc", "pp_cutoffHzDC", "10000", "e_badNewValue"),
+    ("preProc", "pp_cutoffHzDC", "0", "e_badNewValue"),
+    ("gammatone", "fb_nGamma", "0", "e_badNewValue"),
+    ("gammatone", "fb_nGamma", "1e3", "e_badNewValue"),
+    ("gammatone", "fb_highFreqHz", "10001", "e_badNewValue"),
+    ("gammatone", "fb_cfHz", "[100, nan]", "e_badNewValue"),
+    ("ild", "ild_hSizeSec", "-0.01", "e_badNewValue"),
+    ("ratemap", "rm_decaySec", "inf", "e_badNewValue"),
+    ("crosscorrelation", "cc_maxDelaySec", "10.5", "e_badNewValue"),
+)
+
+
+def test_rejected_modifications(afe: Session) -> None:
+    afe.build(*CHAIN, fb_nChannels=2, pp_bRemoveDC=True)
+    before = snapshot(afe)
+    for name, parameter, text, ex in REJECTED:
+        exception, detail = afe.refused("modifyParameter", nameProc=name, nameParam=parameter, newValue=text)
+        assert exception == f"::rosAFE::{ex}", (name, parameter, text)
+        assert (parameter in detail["what"]) if ex == "e_badNewValue" else detail == {}, (name, parameter, text)
+        assert snapshot(afe) == before, (name, parameter, text)
+
+
+def test_removal_includes_descendants_and_frees_the_names(afe: Session) -> None:
+    afe.build(*CHAIN, fb_nChannels=2)
+    afe.ok("IldProc", name="second")
+    afe.ok("GammatoneProc", name="sibling", fb_nChannels=2)
+    afe.ok("removeProcessor", name="gammatone")
+    assert afe.processors() == {"input": ["input"], "preProc": ["preProc"], "gammatone": ["sibling"]}
+    afe.wait_activities(["InputProc", "PreProc", "GammatoneProc"])
+    gone = [afe.topic(kind) for kind in ("gammatone", "ihc", "ild", "ratemap", "crossCorrelation")]
+    assert not set(gone) & afe.graph.topics(), "closed when the call returns"
+    for request in CHAIN[1:]:
+        afe.ok(request)
+    assert set(gone) <= afe.graph.topics()
+
+
+def test_rejected_removals(afe: Session) -> None:
+    afe.build("PreProc", "GammatoneProc", fb_nChannels=2)
+    before = snapshot(afe)
+    for name in ("input", "nobody", "", "name", "Preproc"):
+        assert afe.refused("removeProcessor", name=name) == ("::rosAFE::e_noSuchProcessor", {}), name
+    assert snapshot(afe) == before
+
+
+def test_stop_and_start_again(afe: Session) -> None:
+    afe.ok("Stop")
+    microphone = afe.build(*CHAIN, block=800, fb_nChannels=2)
+    microphone.play(noise(1600))
+    afe.read("ild", 1601)
+    for _ in range(2):
+        afe.ok("Stop")
+        assert afe.processors() == {}
+        assert afe.ok("getSignals").signals.input == []
+        afe.wait_activities([])
+        assert afe.refused("PreProc")[0] == "::rosAFE::e_noUpperDependencie"
+    assert microphone.subscribed, "the connection is kept"
+    for request in ("InputProc", *CHAIN):
+        afe.ok(request, **({"nFramesPerBlock": 800} if request == "InputProc" else {}))
+    microphone.play(noise(800, 3))
+    message = afe.read("ild", 2401)
+    assert message.framesOnPort == 100
+
+
+# --- connect_port and the rest ----------------------------------------------------------------------------------
+
+
+def test_rejected_connections(afe: Session) -> None:
+    microphone = afe.build(block=400)
+    for local, remote, ex in (
+        ("audio", microphone.topic, "no_such_inport"),
+        ("", "", "no_such_inport"),
+        ("dataObj", microphone.topic, "no_such_inport"),
+        ("Audio", "nobody/Audio", "no_such_outport"),
+        ("Audio", "", "no_such_outport"),
+        ("Audio", "not a name!", "no_such_outport"),
+        ("Audio", "rosAFE/genom_state", "port_io"),
+    ):
+        assert afe.refused("connect_port", local=local, remote=remote) == (f"::genom::{ex}", {}), (local, remote)
+    signal = noise(400)
+    microphone.play(signal)
+    assert afe.read("input", 401).left[-1] == signal[0, -1] / (2**31 - 1), "the old connection is kept"
+
+
+def test_names_are_resolved_as_in_ros(afe: Session) -> None:
+    microphone = afe.listen()
+    relative = microphone.topic[1:]
+    for remote in (relative, microphone.topic, f"/{relative}/"):
+        afe.ok("connect_port", local="Audio", remote=remote)
+    wait_for(lambda: microphone.subscribed)
+
+
+def test_there_are_no_remote_services(afe: Session) -> None:
+    assert afe.refused("connect_service", local="any", remote="thing") == ("::genom::no_such_remote", {})
+
+
+def test_missing_activities_cannot_be_aborted(afe: Session) -> None:
+    for number in (0, 99999, 2**32 - 1):
+        assert afe.refused("abort_activity", activity=number) == ("::genom::no_such_activity", {})
+
+
+def test_errors_are_valid_json_for_any_name(afe: Session) -> None:
+    """Quotes, backslashes, line ends and other alphabets of the request are part of the reason."""
+    afe.build("PreProc")
+    for name in ('say "hi"', "back\\slash", "two\nlines", "日本語", "tab\t"):
+        response = afe.call("GammatoneProc", name=name)
+        body = json.loads(response.genom_exdetail)
+        assert body["ex"] == "::rosAFE::e_badNewValue" and repr(name) in body["detail"]["what"]
+
+
+def test_eight_simultaneous_clients(afe: Session) -> None:
+    """Each builds, queries, modifies and removes its own branch; the tree is consistent in the end."""
+    microphone = afe.build("PreProc", block=400)
+
+    def work(number: int) -> None:
+        for _ in range(3):
+            name = f"g{number}"
+            afe.ok("GammatoneProc", name=name, fb_nChannels=2)
+            afe.ok("IhcProc", name=f"i{number}", upperDepName=name)
+            afe.ok("IldProc", name=f"l{number}", upperDepName=f"i{number}")
+            assert afe.ok("getDependencies", nameProc=f"l{number}").dependencies[-3:] == [
+                name,
+                f"i{number}",
+                f"l{number}",
+            ]
+            afe.ok("modifyParameter", nameProc=f"i{number}", nameParam="ihc_method", newValue="halfwave")
+            assert afe.refused("GammatoneProc", name=name)[0] == "::rosAFE::e_existsAlready"
+            afe.ok("getSignals")
+            afe.ok("removeProcessor", name=name)
+
+    harness.run_together(8, work)
+    assert afe.processors() == {"input": ["input"], "preProc": ["preProc"]}
+    microphone.play(noise(400))
+    afe.read("preProc", 401)
+
+
+def test_simultaneous_requests_for_one_name_create_one_processor(afe: Session) -> None:
+    afe.build("PreProc")
+    responses = harness.run_together(8, lambda _: afe.call("GammatoneProc", fb_nChannels=2))
+    failed = [json.loads(r.genom_exdetail) for r in responses if not r.genom_success]
+    why = "'gammatone' exists already, of kind gammatone"
+    assert failed == [{"ex": "::rosAFE::e_existsAlready", "what": why}] * 7
+    assert afe.processors()["gammatone"] == ["gammatone"]

@@ -1,0 +1,250 @@
+"""The rotation of the head by tf: interpolation, waiting, dropped frames, tilt, limits; and the node in a scene."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rospy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
+from tf2_msgs.msg import TFMessage
+
+from rosafe.localization import angles
+from rosafe.ros1.localizer import transforms
+from rosafe.ros1.localizer.head_rotation import MAX_WAIT, TransformedHead
+from rosafe.ros1.localizer.status import OK, WARN, NodeStatus
+from tests.harness import Graph, wait_for
+from tests.localization.conftest import KEMAR, RATE
+
+START = 1000.0  # s
+
+
+def transform(
+    parent: str, child: str, time: float, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0
+) -> TransformStamped:
+    """Return a transform with angles in degrees."""
+    found = TransformStamped(child_frame_id=child)
+    found.header.frame_id, found.header.stamp = parent, rospy.Time.from_sec(time)
+    (cy, sy), (cp, sp), (cr, sr) = (
+        (math.cos(math.radians(angle) / 2), math.sin(math.radians(angle) / 2)) for angle in (yaw, pitch, roll)
+    )
+    rotation = found.transform.rotation
+    rotation.w, rotation.x = cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy
+    rotation.y, rotation.z = cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+    return found
+
+
+class Head:
+    """A head that is followed, without subscriptions."""
+
+    def __init__(self, delay: float = 0.0) -> None:
+        self.status = NodeStatus(lambda: None)
+        self.head = TransformedHead("world", "head", delay, self.status)
+
+    def tf(self, *found: TransformStamped, static: bool = False) -> None:
+        """Receive a message."""
+        self.head.transforms.add(TFMessage(list(found)), static)
+
+    def turn(self, seconds: float, speed: float, begin: float = START) -> None:
+        """Receive transforms of a head that turns, 20 in each second."""
+        for time in np.arange(0, seconds + 0.01, 0.05):
+            self.tf(transform("world", "head", begin + time, float(angles.wrap(speed * time))))
+
+    @property
+    def dropped(self) -> int:
+        """The number of dropped frames in the diagnostics."""
+        return int(self.status._values.get("frames without a transform", 0))
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time of `time.monotonic` in the module, which the test sets."""
+    now = [50.0]
+    monkeypatch.setattr("rosafe.ros1.localizer.head_rotation.time.monotonic", lambda: now[0])
+    return now
+
+
+def test_the_rotation_is_that_of_the_time_of_each_frame() -> None:
+    head = Head()
+    head.turn(2.0, 100.0)
+    times = START + np.arange(0.003, 1.99, 0.01)
+    yaw, known = head.head.lookup(times)
+    assert known.all() and len(yaw) == len(times)
+    assert np.allclose(angles.difference(yaw, 100 * (times - START)), 0, atol=0.01)
+
+
+def test_audio_delay_corrects_the_sound_card() -> None:
+    head = Head(delay=0.05)
+    head.turn(2.0, 100.0)
+    yaw, _ = head.head.lookup(np.array([START + 1.0]))
+    assert angles.difference(yaw[0], 95.0) == pytest.approx(0, abs=0.01)  # 50 ms at 100 degrees/s are 5 degrees
+
+
+def test_a_chain_of_frames_some_of_them_static() -> None:
+    head = Head()
+    head.tf(transform("map", "world", 0.0, 10.0), transform("torso", "neck", 0.0, 90.0), static=True)
+    for time in (START, START + 1):
+        head.tf(transform("map", "torso", time, 30.0), transform("torso", "arm", time, 70.0))
+        head.tf(transform("neck", "head", time, 20.0 * (time - START)))
+        head.tf(transform("map", "torso", time, 30.0))
+    yaw, known = head.head.lookup(np.array([START + 0.25]))
+    assert known.all() and yaw[0] == pytest.approx(-10 + 30 + 90 + 5, abs=0.01)
+
+
+def test_frames_wait_for_their_transform(clock: list[float]) -> None:
+    head = Head()
+    head.turn(1.0, 10.0)
+    times = START + np.array([0.9, 0.99, 1.01, 1.02])
+    assert len(head.head.lookup(times).yaw) == 2
+    clock[0] += 0.9 * MAX_WAIT
+    assert not len(head.head.lookup(times[2:]).yaw)
+    head.turn(1.0, 10.0, START + 1.0)
+    yaw, known = head.head.lookup(times[2:])
+    assert len(yaw) == 2 and known.all() and not head.dropped
+
+
+def test_frames_without_a_transform_are_dropped_and_counted(clock: list[float]) -> None:
+    head = Head()
+    times = START + np.arange(5) * 0.01
+    assert not len(head.head.lookup(times).yaw) and head.status.state()[0] == WARN
+    clock[0] += 1.01 * MAX_WAIT
+    later = np.append(times, START + 0.05)  # has not waited yet
+    yaw, known = head.head.lookup(later)
+    assert len(yaw) == 5 and not known.any() and head.dropped == 5
+    assert head.status.state() == (WARN, "waiting for the transform from head to world on /tf")
+    head.turn(1.0, 10.0)
+    assert head.head.lookup(later[5:]).known.all()
+    assert head.status.state()[0] == OK
+    head.head.lookup(np.array([START + 1.5]))
+    clock[0] += 1.01 * MAX_WAIT
+    head.head.lookup(np.array([START + 1.5]))
+    assert head.status.state() == (WARN, "no transform from head to world on /tf; the frames are dropped")
+
+
+@pytest.mark.parametrize(("pitch", "roll", "warns"), [(14, 0, False), (16, 0, True), (0, -16, True), (-10, 10, False)])
+def test_only_the_vertical_rotation_counts(pitch: float, roll: float, warns: bool) -> None:
+    head = Head()
+    for time in (START, START + 1):
+        head.tf(transform("world", "head", time, 40.0, pitch, roll))
+    assert head.head.lookup(np.array([START + 0.5])).yaw[0] == pytest.approx(40.0, abs=0.01)
+    level, text = head.status.state()
+    assert (level == WARN) == warns and ("tilted" in text) == warns
+    for time in (START + 2, START + 3):
+        head.tf(transform("world", "head", time, 40.0))
+    head.head.lookup(np.array([START + 2.5]))
+    assert head.status.state()[0] == OK
+
+
+def test_time_jumps_back() -> None:
+    head = Head()
+    head.turn(2.0, 10.0, START + 100)
+    assert head.head.lookup(np.array([START + 101.0])).known.all()
+    head.turn(2.0, 20.0)  # rosbag play in a loop: 100 s earlier
+    head.head.lookup(np.array([START + 0.1]))
+    head.turn(2.0, 20.0)
+    assert head.head.lookup(np.array([START + 1.0])).yaw[0] == pytest.approx(20.0, abs=0.01)
+
+
+def test_simulated_time_from_zero() -> None:
+    head = Head()
+    head.turn(2.0, 20.0, 0.05)
+    assert head.head.lookup(np.array([1.05])).yaw[0] == pytest.approx(20.0, abs=0.01)
+
+
+def test_unsuitable_transforms_are_ignored(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(transforms, "MAX_FRAMES", 10)
+    head = Head()
+    head.turn(1.0, 10.0)
+    bad = [transform("world", "head", START + 0.5) for _ in range(4)]
+    bad[0].transform.rotation.w = 0.0
+    bad[1].transform.rotation.z = math.nan
+    bad[2].transform.translation.x = math.inf
+    bad[3].transform.rotation.x = 1e200
+    head.tf(*bad, transform("", "a", START), transform("a", "", START), transform("a", "a", START))
+    head.tf(transform("world", "x" * 300, START), transform("", "head", START), transform("x" * 300, "head", START))
+    for number in range(20):
+        head.tf(transform("world", f"frame{number}", START), transform(f"frame{number}", "moved", START), static=True)
+    head.tf(transform("head", "world", START))  # a loop: tf2 finds no rotation, but the node does not fail
+    head.head.lookup(np.array([START + 0.2]))
+    assert len(head.head.transforms._parents) <= 10
+    assert head.head.transforms._buffer.all_frames_as_string().count("Frame") <= 12
+    assert "TF_" not in capfd.readouterr().err
+
+
+SCENE = f"""
+sample_rate: {RATE}
+seed: 5
+head: {KEMAR}
+head_yaw: [[0, 0], [1, 30], [3, -30], [5, 30], [7, -30], [9, 30], [11, -30], [13, 30], [15, -30], [17, 30], [19, -30]]
+noise: {{snr_db: 30}}
+sources:
+  - {{name: talker, file: FILE, loop: true, level_db: -25, azimuth: 40}}
+"""
+
+
+@pytest.mark.exploration  # tests/ros1/localizer/test_node.py has another head that turns
+def test_the_node_follows_the_head(graph: Graph, kemar_model: Path, tmp_path: Path) -> None:
+    import soundfile
+    from rosAFE.msg import SoundSources
+
+    from tests.localization.conftest import modulated
+
+    soundfile.write(tmp_path / "talker.wav", modulated(5.0, 2), RATE)
+    (tmp_path / "scene.yaml").write_text(SCENE.replace("FILE", str(tmp_path / "talker.wav")))
+    command = ("rosafe", "localize", "--head", str(kemar_model), "--world-frame", "world", "--noise", "none")
+
+    def localizer_status(messages: list[DiagnosticArray]) -> list[tuple[int, str]]:
+        return [
+            (int.from_bytes(s.level, "little") if isinstance(s.level, bytes) else s.level, s.message)
+            for m in list(messages)
+            for s in m.status
+            if "localization" in s.name
+        ]
+
+    with (
+        graph.node("bass-ros"),
+        graph.node("rosAFE-ros"),
+        graph.collect("/localizer/sources", SoundSources) as sources,
+        graph.collect("/diagnostics", DiagnosticArray) as diagnostics,
+        graph.start(*command) as node,
+    ):
+        wait_for(lambda: sources or not node.alive, what=lambda: f"{node}")
+        assert graph.call("/bass/Acquire", device=f"scene:{tmp_path / 'scene.yaml'}").genom_success
+        found = wait_for(
+            lambda: [s for m in list(sources) for s in m.sources if s.probability > 0.5][30:], what=lambda: f"{node}"
+        )
+        errors = np.abs(angles.difference(np.degrees([source.azimuth for source in found]), 40.0))
+        assert np.median(errors) < 6
+        assert {message.header.frame_id for message in sources} == {"world"}
+        assert any(level == OK for level, _ in localizer_status(diagnostics))
+
+
+def test_without_tf_there_are_no_sources(graph: Graph, sphere_model: Path) -> None:
+    from rosAFE.msg import SoundSources
+
+    from tests.ros1.localizer.room import Room
+
+    command = ("rosafe", "localize", "--head", str(sphere_model), "--world-frame", "world", "--noise", "none")
+    with (
+        Room(graph) as room,
+        graph.node("rosAFE-ros"),
+        graph.collect("/localizer/sources", SoundSources) as sources,
+        graph.collect("/diagnostics", DiagnosticArray) as diagnostics,
+        graph.start(*command) as node,
+    ):
+        room.azimuth = 30.0
+
+        def dropped() -> list[int]:
+            values = [v for m in list(diagnostics) for s in m.status if "localization" in s.name for v in s.values]
+            return [int(v.value) for v in values if v.key == "frames without a transform" and int(v.value) > 50]
+
+        wait_for(lambda: dropped() or not node.alive, what=lambda: f"{node}")
+        last = next(s for m in reversed(diagnostics) for s in m.status if "localization" in s.name)
+        assert last.level in (WARN, bytes([WARN])) and "transform" in last.message
+        count = len(sources)
+        wait_for(lambda: len(sources) > count + 5)
+        assert not any(message.sources for message in sources)
+        assert {message.header.frame_id for message in sources} == {"world"}

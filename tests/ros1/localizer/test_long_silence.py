@@ -1,0 +1,126 @@
+"""Ten minutes of silence between two sounds, without waiting for them."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rospy
+
+from rosafe.localization import cues
+from rosafe.localization.head import Head
+from rosafe.localization.localizer import Localizer
+from rosafe.processing.stream import Stream
+from rosafe.ros1.localizer import frame_queue, localization_loop
+from rosafe.ros1.localizer.frame_queue import FrameQueue
+from rosafe.ros1.localizer.frame_source import _HEAD, FrameFormat
+from rosafe.ros1.localizer.head_rotation import FixedHead
+from rosafe.ros1.localizer.localization_loop import LocalizationLoop
+from rosafe.ros1.localizer.status import OK, NodeStatus
+from rosafe.ros1.localizer.tree_link import Link
+from tests.localization.conftest import RATE, modulated
+
+BLOCK = RATE  # 1 s
+SILENCE = 600  # blocks
+START = 1_700_000_000.0  # clock time of the first sample
+
+
+class Robot:
+    """The loop of the localizer with the messages of a rosAFE; time passes only with blocks."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, head: Path) -> None:
+        self.index = 0
+        self.published: list[tuple[float, list[float]]] = []  # stamp and azimuths of present sources
+        clock: Any = SimpleNamespace(monotonic=lambda: self.index / RATE)
+        for module in (localization_loop, frame_queue):
+            monkeypatch.setattr(module, "time", clock)
+        monkeypatch.setattr(rospy, "Subscriber", lambda *_, **__: SimpleNamespace(unregister=lambda: None))
+        monkeypatch.setattr(rospy, "get_time", lambda: START + self.index / RATE)
+        frame_clock: Any = SimpleNamespace(
+            covers=lambda *_: True,
+            problem="",
+            missing="sound",
+            time=lambda frame: SimpleNamespace(ros=rospy.Time.from_sec(START + frame / RATE)),
+        )
+        publishers: Any = SimpleNamespace(begin_again=lambda: None, publish=self._publish)
+        mute: Any = SimpleNamespace(active=False, muted=lambda times: np.zeros(len(times), bool))
+        self.status = NodeStatus(lambda: None)
+        self.loop = LocalizationLoop(
+            lambda model: Localizer(RATE, model, keep_history=False),
+            publishers,
+            frame_clock,
+            FrameQueue(FixedHead(), mute),
+            self.status,
+            lambda: None,
+        )
+        model = Localizer(RATE, str(head)).model
+        window, hop = (round(model.parameters[f"cc_{name}"] * RATE) for name in ("wSizeSec", "hSizeSec"))
+        frame_format = FrameFormat(RATE, model.channels, window, hop, BLOCK)
+        self.loop.connect(Link(model, frame_format, dict.fromkeys(cues.KINDS, "")))
+        self._stream = Stream(RATE, model.parameters, list(cues.KINDS))
+
+    def _publish(self, time: float, tracks: Any, *_: Any) -> None:
+        present = [track.azimuth for track in tracks if track.id and track.probability > 0.5]
+        self.published.append((time, present))
+
+    def features(self, block: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the representations of a block of sound."""
+        features = self._stream.process(block)
+        return {kind: np.asarray(features[kind]) for kind in cues.KINDS}
+
+    def receive(self, features: dict[str, np.ndarray]) -> None:
+        """Deliver the representations of a block, and let the loop do what its thread does."""
+        self.index += BLOCK
+        source = self.loop._source
+        assert source is not None
+        for port in source._ports:
+            found = features[port.kind]
+            left, right = found if found.ndim == 3 else (found, None)
+            message: Any = SimpleNamespace(
+                data=_HEAD.pack(100, self.index, found.shape[-1]),
+                framesOnPort=found.shape[-1],
+                left=left,
+                right=right,
+                problem="",
+                missing="sound",
+            )
+            message.decode = lambda message=message: message
+            port._receive(message)
+        self.loop._attempt(self.loop._use_new_frames)
+        self.loop._attempt(self.loop._publish)
+
+    def hear(self, sound: np.ndarray) -> None:
+        """Deliver sound, (2, n)."""
+        for begin in range(0, sound.shape[1], BLOCK):
+            self.receive(self.features(sound[:, begin : begin + BLOCK]))
+
+
+def test_long_silence(monkeypatch: pytest.MonkeyPatch, sphere_model: Path) -> None:
+    robot = Robot(monkeypatch, sphere_model)
+    talker = Head.sphere().render(modulated(4.0, 3), RATE, azimuth=40.0)
+    robot.hear(talker)
+    robot.hear(talker)
+    assert any(abs(azimuth - 40) < 10 for azimuth in robot.published[-1][1])
+    silence = np.zeros((2, BLOCK))
+    robot.hear(np.tile(silence, 3))
+    assert not robot.published[-1][1]
+    features = robot.features(silence)  # from here on they are equal
+    memory = []
+    for second in range(SILENCE):
+        robot.receive(features)
+        if second % 250 == 50:
+            gc.collect()
+            memory.append(sys.getallocatedblocks() - 4 * len(robot.published))  # of this list
+    stamps = np.array([stamp for stamp, _ in robot.published[-SILENCE:]])
+    assert np.abs(np.diff(stamps) - 1).max() < 1e-6 and abs(stamps[-1] - (START + robot.index / RATE)) < 0.03
+    assert not any(azimuths for _, azimuths in robot.published[-SILENCE:])
+    assert max(memory) - memory[0] < SILENCE, memory
+    robot.hear(talker)
+    robot.hear(talker)
+    assert any(abs(azimuth - 40) < 10 for azimuth in robot.published[-1][1])
+    assert robot.status.state()[0] == OK and "lost frames" not in robot.status._values

@@ -1,0 +1,96 @@
+"""Goals of activities on a slow graph: the time of sending, and goals without an answer."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+
+from rosafe.interface import ComponentError
+from rosafe.ros1.client import actions
+from rosafe.ros1.client.actions import ActionClient
+from rosafe.ros1.client.graph import Graph
+
+
+class Topic:
+    """A publisher or subscriber of rospy with a given number of connections."""
+
+    def __init__(self) -> None:
+        self.connections = 0
+        self.sent: list[Any] = []
+
+    def get_num_connections(self) -> int:
+        return self.connections
+
+    def publish(self, message: Any) -> None:
+        self.sent.append(message)
+
+
+class Action:
+    """The topics of bass's Acquire, as its client sees them."""
+
+    def __init__(self, client: ActionClient) -> None:
+        self.client = client
+        self.goal, self.cancel, self.result, self.status = topics = [Topic() for _ in range(4)]
+        client._publishers.update(goal=topics[0], cancel=topics[1])
+        client._subscribers += topics[2:]
+
+    def accept(self) -> None:
+        """Publish the status that an action server publishes for a running goal."""
+        from actionlib_msgs.msg import GoalStatus, GoalStatusArray
+
+        status = GoalStatus(status=GoalStatus.ACTIVE)
+        status.goal_id.id = self.goal.sent[-1].goal_id.id
+        self.client._on_status(GoalStatusArray(status_list=[status]))
+
+
+def run(test: Callable[[Action], Awaitable[None]]) -> None:
+    """Run a test on an action of a component that does not run."""
+
+    async def checked() -> None:
+        graph = Graph("http://127.0.0.1:9")
+        await test(Action(ActionClient(graph, "bass", "bass", "Acquire")))
+        await graph.close()
+
+    asyncio.run(checked())
+
+
+@pytest.mark.parametrize("missing", ["goal", "result", "status"])
+def test_a_goal_is_sent_when_its_result_can_be_received(monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
+    """A result is sent once: a client that is not connected yet would miss it."""
+    monkeypatch.setattr(actions, "REPEAT_SECONDS", 0.01)
+
+    async def check(action: Action) -> None:
+        for topic in (action.goal, action.cancel, action.result, action.status):
+            topic.connections = 1
+        late: Topic = getattr(action, missing)
+        late.connections = 0
+        sending = asyncio.create_task(action.client.send({"device": "scene:"}))
+        done, _ = await asyncio.wait({sending}, timeout=0.2)
+        assert not done and action.goal.sent == []
+        late.connections = 1
+        async with asyncio.timeout(60):
+            while not action.goal.sent:
+                await asyncio.sleep(0.01)
+            action.accept()
+            goal = await sending
+        assert goal.acknowledged.is_set() and action.goal.sent[0].goal.device == "scene:"
+        assert len({message.goal_id.id for message in action.goal.sent}) == 1
+
+    run(check)
+
+
+def test_a_goal_without_an_answer_is_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(actions, "ANSWER_SECONDS", 0.1)
+
+    async def check(action: Action) -> None:
+        for topic in (action.goal, action.cancel, action.result, action.status):
+            topic.connections = 1
+        with pytest.raises(ComponentError, match=r"bass did not answer /bass/Acquire within 0\.1 s"):
+            await action.client.send({"device": "scene:"})
+        assert action.cancel.sent[0].id == action.goal.sent[0].goal_id.id
+        assert action.client.goals == {}
+
+    run(check)

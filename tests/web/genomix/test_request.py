@@ -1,0 +1,339 @@
+"""Whole trees in one request, with real nodes: over HTTP, in tclsh, on the command line, and concurrently."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rosafe
+from tests import harness
+from tests.web.genomix.world import HttpError, World
+
+pytestmark = pytest.mark.ros
+
+RATE = 16000
+CHAIN = ["input_0", "time_0", "filterbank_0", "innerhaircell_0", "ild_0"]
+
+
+@pytest.fixture
+def sound(world: World) -> Iterator[World]:
+    """The module's world, in which bass captures and rosAFE is idle."""
+    world.http.call("bass/Acquire", {"device": "scene:", "sampleRate": RATE})
+    yield world
+
+
+def names(world: World, component: str = "rosAFE") -> list[str]:
+    """All processors of a component."""
+    parameters = world.http.call(f"{component}/getParameters")["parameters"]
+    return [structure["name"] for structures in parameters.values() for structure in structures]
+
+
+def activities(world: World, component: str) -> list[str]:
+    """Return the names of a component's running activities from its latest state."""
+    tasks = world.http.call(f"{component}/genom_state")["genom_state"]["task"]
+    return [activity["name"] for task in tasks for activity in task["activity"]]
+
+
+def parameters(world: World, kind: str) -> list[dict[str, Any]]:
+    """The structures of all processors of one kind."""
+    return list(world.http.call("rosAFE/getParameters")["parameters"][kind])
+
+
+def refusal(call: Callable[[], object]) -> HttpError:
+    """The error that a call ends with."""
+    with pytest.raises(HttpError) as refused:
+        call()
+    return refused.value
+
+
+def command(world: World, *arguments: str) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of `rosafe request`."""
+    done = world.graph.run("rosafe", "request", *arguments, check=False)
+    return done.returncode, done.stdout, done.stderr
+
+
+# --- HTTP -------------------------------------------------------------------------------------------------------
+
+
+def test_the_tree_and_its_numbers(sound: World) -> None:
+    """The port has the output of `rosafe.process` for the same input and parameters."""
+    requested = {"fb_nChannels": 5, "ild_wSizeSec": 0.04, "ild_hSizeSec": 0.02, "ihc_method": "halfwave"}
+    response = sound.http.call("rosAFE/request", {"representation": "ild", **requested, "nFramesPerBlock": RATE // 5})
+    assert response == {
+        "name": "ild_0",
+        "dependencies": CHAIN,
+        "created": CHAIN,
+        "reused": [],
+        "unused": [],
+        "port": "ildPort",
+        "topic": "/rosAFE/ildPort/ild_0",
+    }
+    assert response["topic"] in sound.graph.topics()
+    assert sound.http.call("rosAFE/getDependencies", ["ild_0"])["dependencies"] == CHAIN
+    (gammatone,) = parameters(sound, "gammatone")
+    assert (gammatone["fb_nChannels"], gammatone["fb_lowFreqHz"]) == (5, 80.0)
+
+    def heard() -> dict[str, Any]:
+        return dict(sound.http.call("rosAFE/inputProcPort")["inputProcPort"])
+
+    start = heard()["lastFrameIndex"]
+    harness.wait_for(lambda: heard()["lastFrameIndex"] >= start + 2 * RATE)  # no zeros, nor filters at their start
+    sound.http.call("bass/Stop")
+    ild = harness.wait_for(lambda: _settled(sound, "inputProcPort", "ildPort/ild_0"))
+    ears = np.array([heard()[ear]["data"] for ear in ("left", "right")])
+    expected = rosafe.process(ears, RATE, parameters=requested, outputs=["ild"])["ild"][:, -25:]
+    found = np.array([channel["data"] for channel in ild["left"]["dataN"]])[:, -25:]
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
+    assert np.ptp(found) > 1
+
+
+def _settled(world: World, first: str, second: str) -> dict[str, Any]:
+    """Return the second port when it has reached the first one, which has stopped; empty before."""
+    one, two = (world.http.call(f"rosAFE/{port}")[port.partition("/")[0]] for port in (first, second))
+    again = world.http.call(f"rosAFE/{first}")[first.partition("/")[0]]
+    return two if one["lastFrameIndex"] == two["lastFrameIndex"] == again["lastFrameIndex"] else {}
+
+
+def test_matching_processors_are_reused(sound: World) -> None:
+    call = sound.http.call
+    assert call("rosAFE/request", ["ild", {"fb_nChannels": 3}])["created"] == CHAIN
+    assert call("rosAFE/request", ["ild", {"fb_nChannels": "3"}])["reused"] == CHAIN
+    response = call("rosAFE/request", ["ratemap", {"fb_nChannels": 3, "ild_hSizeSec": 0.02, "nFramesPerBlock": 100}])
+    assert (response["created"], response["reused"]) == (["ratemap_0"], CHAIN[:-1])
+    assert response["unused"] == ["ild_hSizeSec", "nFramesPerBlock"]
+    response = call("rosAFE/request", ["crossCorrelation", {"fb_cfHz": [200, 400]}])
+    assert response["created"] == ["filterbank_1", "innerhaircell_1", "crosscorrelation_0"]
+    assert response["topic"] == "/rosAFE/crossCorrelationPort/crosscorrelation_0"
+    (_, second) = parameters(sound, "gammatone")
+    assert call("rosAFE/request", {"representation": "ihc", "gammatone": second})["name"] == "innerhaircell_1"
+    assert call("rosAFE/request", ["input"])["port"] == "inputProcPort"
+    # After manual changes, the processor no longer matches the request, and then matches it again.
+    changed = {"nameProc": "time_0", "nameParam": "pp_bRemoveDC", "newValue": "1"}
+    call("rosAFE/modifyParameter", changed)
+    assert call("rosAFE/request", ["time"])["created"] == ["time_1"]
+    assert call("rosAFE/request", ["ild", {"fb_nChannels": 3, "pp_bRemoveDC": 1}])["reused"] == CHAIN
+    # The middle of the tree was removed.
+    call("rosAFE/removeProcessor", ["filterbank_0"])
+    response = call("rosAFE/request", ["ild", {"fb_nChannels": 3, "pp_bRemoveDC": True}])
+    assert response["dependencies"] == ["input_0", "time_0", "filterbank_2", "innerhaircell_2", "ild_0"]
+    # Manually created processors are used too.
+    call("rosAFE/Stop")
+    call("rosAFE/InputProc")
+    call("rosAFE/PreProc", {"pp_coefPreEmphasis": 0.9})
+    response = call("rosAFE/request", ["filterbank", {"pp_coefPreEmphasis": 0.9}])
+    assert response["dependencies"] == ["input", "preProc", "filterbank_0"]
+    response = call("rosAFE/request", ["time", {"pp_coefPreEmphasis": 0}])
+    assert response["created"] == ["time_0"]
+    assert parameters(sound, "preProc")[1]["pp_coefPreEmphasis"] == 0
+    assert call("rosAFE/request", ["time", {"pp_coefPreEmphasis": 0}])["reused"] == ["input", "time_0"]
+
+
+def test_a_failed_request_leaves_no_processor(sound: World) -> None:
+    world, http = sound, sound.http
+    refused = refusal(lambda: http.call("rosAFE/request", ["ild", {"fb_highFreqHz": 30000}]))
+    assert (refused.status, refused.ex) == (422, "::rosAFE::e_badNewValue")
+    assert "expected channels below half the sample rate" in refused.what
+    assert names(world) == []
+    harness.wait_for(lambda: activities(world, "rosAFE") == [])
+    http.call("rosAFE/request", ["time"])
+    for given, ex, status in (
+        ({"fb_highFreqHz": 30000, "pp_bRemoveDC": 1}, "::rosAFE::e_badNewValue", 422),
+        ({"fb_nChannels": 5000}, "::rosAFE::e_badNewValue", 422),
+        ({"in_doNormalize": 0}, "::rosAFE::e_existsAlready", 422),
+        ({"fb_nERB": 1}, "::genom::serialization", 400),
+        ({"fb_nChannels": "many"}, "::genom::serialization", 400),
+    ):
+        refused = refusal(lambda given=given: http.call("rosAFE/request", ["ild", given]))  # type: ignore[misc]
+        assert (refused.ex, refused.status) == (ex, status)
+        assert names(world) == ["input_0", "time_0"]
+    assert refusal(lambda: http.call("bass/request", ["ild"])).ex == "::genom::no_such_service"
+    assert refusal(lambda: http.call("rosAFE/request", ["spikes"])).ex == "::genom::serialization"
+
+
+def test_in_the_background(sound: World) -> None:
+    number = sound.http.send("rosAFE/request", ["ild", {"fb_nChannels": 2}])
+    assert number.startswith("rosAFE::")
+    assert sound.http.wait(number, "done")["output"]["dependencies"] == CHAIN
+    number = sound.http.send("rosAFE/request", ["ild", {"fb_nChannels": 1000, "fb_lowFreqHz": 9000}])
+    assert sound.http.wait(number, "error")["exception"]["ex"] == "::rosAFE::e_badNewValue"
+    assert refusal(lambda: sound.http.send("rosAFE/request", ["ild", {"x": 1}])).ex == "::genom::serialization"
+
+
+def test_four_concurrent_clients(sound: World) -> None:
+    """Two HTTP clients, one of them in a session, and two commands: one tree without duplicates."""
+    channels = ["fb_nChannels=2", "fb_nChannels=2", "fb_nChannels=3", "fb_nChannels=3"]
+
+    def by_http(session: str, count: str) -> Any:
+        query = {"s": session} if session else {}
+        return sound.http.call("rosAFE/request", ["ild", {"fb_nChannels": count[-1]}], **query)
+
+    def by_command(_: str, count: str) -> Any:
+        code, out, err = command(sound, "ild", "--json", count)
+        assert code == 0, err
+        return json.loads(out)
+
+    with ThreadPoolExecutor(4) as pool:
+        works = [(by_http, ""), (by_command, ""), (by_http, "mine"), (by_command, "")]
+        answers = [
+            answer.result()
+            for answer in [pool.submit(work, who, count) for (work, who), count in zip(works, channels, strict=True)]
+        ]
+    assert answers[0]["dependencies"] == answers[1]["dependencies"]
+    assert answers[2]["dependencies"] == answers[3]["dependencies"]
+    assert [s["fb_nChannels"] for s in parameters(sound, "gammatone")] in ([2, 3], [3, 2])
+    assert len(names(sound)) == 8
+    assert sorted(name for answer in answers for name in answer["created"]) == sorted(names(sound))
+
+
+def test_another_instance_and_its_end(world: World) -> None:
+    world.http.call("bass/Acquire", {"device": "scene:"})
+    with world.graph.node("rosAFE-ros", "-i", "left") as node:
+        response = world.http.call("left/request", ["filterbank", {"fb_nChannels": 2}])
+        assert response["topic"] == "/left/gammatonePort/filterbank_0"
+        assert world.http.call("left/gammatonePort/filterbank_0")["gammatonePort"]["numberOfChannels"] == 2
+        assert names(world) == [] and len(names(world, "left")) == 3
+        code, out, err = command(world, "filterbank", "-i", "left", "fb_nChannels=2")
+        assert (code, err) == (0, "")
+        assert out.splitlines()[-1].split() == ["reused", "filterbank_0", "/left/gammatonePort/filterbank_0"]
+        node.stop(signal.SIGKILL)
+        assert refusal(lambda: world.http.call("left/request", ["ild"])).ex == "::genom::mwerr"
+    code, _, err = command(world, "ild", "-i", "left")
+    assert code == 1 and "start it with: rosAFE-ros -i left" in err and err.count("\n") == 1
+
+
+# --- Tcl --------------------------------------------------------------------------------------------------------
+
+
+def test_tcl(sound: World) -> None:
+    script = """
+        set g [genomix::connect $address]
+        $g load rosAFE
+        show [::rosAFE::request ild {fb_nChannels 16}]
+        show [dict get [rosAFE::request {representation ild fb_nChannels 16}] created]
+        show [dict get [rosAFE::request filterbank {fb_cfHz {500 1000}}] topic]
+        show [dict get [rosAFE::request time] name]
+        set request [rosAFE::request ratemap {fb_nChannels 16} & show callback]
+        show [$request wait 60000] [dict get [$request result] name]
+        after 50 {set forever 1}; vwait forever
+        set structure [dict remove [dict get [rosAFE::getParameters] parameters gammatone 0] name]
+        show [dict get [rosAFE::request ild $structure] name]
+        show [lindex [failure {rosAFE::request}] 1 2 1]
+        show [lindex [failure {rosAFE::request ild fb_nChannels 16}] 1 2 1]
+        show [lindex [failure {rosAFE::request ild {fb_nChannels}}] 1 1]
+        show [lindex [failure {rosAFE::request ild {fb_nERB 16}}] 1 1]
+        show [lindex [failure {rosAFE::request ild {fb_nChannels 2000}}] 1 1]
+        puts [rosAFE::request -h]
+    """
+    chain = "0 input_0 1 time_0 2 filterbank_0 3 innerhaircell_0 4 ild_0"
+    lines = sound.lines(script)
+    assert lines[:5] == [
+        f"name ild_0 dependencies {{{chain}}} created {{{chain}}} reused {{}} unused {{}} port ildPort "
+        "topic /rosAFE/ildPort/ild_0",
+        "",
+        "/rosAFE/gammatonePort/filterbank_1",
+        "time_0",
+        "done|ratemap_0",
+    ]
+    assert lines[5] == "callback|::genomix::request1"
+    assert lines[6] == "ild_0"
+    assert lines[7].startswith("request: representation is missing; one of input, time, filterbank")
+    assert lines[8] == 'request: expected a dict of parameters after representation, got "fb_nChannels 16"'
+    assert lines[9:12] == ["::genom::serialization"] * 2 + ["::rosAFE::e_badNewValue"]
+    assert lines[13] == "  rosAFE::request representation ?{parameter value ...}?"
+    assert lines[14].startswith("  representation (string, no default, one of input, time")
+
+
+# --- the command ------------------------------------------------------------------------------------------------
+
+
+def test_the_command(sound: World) -> None:
+    world = sound
+    code, out, err = command(world, "ild", "fb_nChannels=16", "--connect", "bass/Audio", "nFramesPerBlock=1600")
+    assert (code, err) == (0, "")
+    ports = ["inputProcPort", "preProcPort/time_0", "gammatonePort/filterbank_0", "ihcPort/innerhaircell_0"]
+    shown = [f"created  {name:15}  /rosAFE/{port}" for name, port in zip(CHAIN, [*ports, "ildPort/ild_0"], strict=True)]
+    assert out.splitlines() == shown
+    code, out, err = command(world, "time", "cc_wname=hann", "nFramesPerBlock=1")
+    assert (code, out.split()[::3]) == (0, ["reused", "reused"])
+    assert err.splitlines() == [
+        "rosafe request: cc_wname has no effect on this representation",
+        "rosafe request: nFramesPerBlock has no effect: the input exists already",
+    ]
+    # before a processor is created or rejected
+    code, out, err = command(world, "ILD", "fb_highFreqHz=99999", "--connect", "foo/bar")
+    assert (code, out) == (1, "")
+    vain, refused = err.splitlines()
+    assert vain == "rosafe request: connect has no effect: the input exists already"
+    assert refused.startswith("rosafe request: ::rosAFE::e_badNewValue: fb_highFreqHz: ")
+    code, out, err = command(world, "--json", "ratemap", "rm_decaySec=0.01", "fb_cfHz=500,1000,2000")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["created"] == ["filterbank_1", "innerhaircell_1", "ratemap_0"]
+    assert parameters(world, "gammatone")[1]["fb_cfHz"] == [500, 1000, 2000]
+    assert parameters(world, "ratemap")[0]["rm_decaySec"] == 0.01
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        ([], 2, "the following arguments are required: REPRESENTATION;"),
+        (["spikes"], 1, "representation: expected one of input, time"),
+        (["ild", "fb_nChannels"], 1, "expected NAME=VALUE, got 'fb_nChannels'"),
+        (["ild", "fb_nChannels=1", "fb_nChannels=2"], 1, "fb_nChannels: expected one value, got two"),
+        (["ild", "fb_nERB=1"], 1, "parameters: expected a known parameter, got 'fb_nERB'; there are: nFramesPerBlock"),
+        (["ild", "fb_nchannels=1"], 1, "; did you mean fb_nChannels?\n"),
+        (["rate_map"], 1, "; did you mean ratemap?\n"),
+        (["ild", "representation=time"], 1, "expected a known parameter, got 'representation'"),
+        (["ild", "fb_nChannels=-1"], 1, "fb_nChannels: expected a number in the range of unsigned long, got -1"),
+        (["ild", "ihc_method=hilbrt"], 1, "ihc_method: expected one of none, halfwave"),
+        (["ild", "nFramesPerBlock=0"], 1, "nFramesPerBlock: expected a number from 1 to 10000000, got 0"),
+        (["ild", "--wrong"], 2, "unrecognized arguments: --wrong"),
+        (["ild", "-i", "a b"], 1, "got 'a b'"),
+        (["ild", "-i", "bass"], 1, "/bass: expected the component rosAFE, got bass"),
+        (["ild", "--connect", "no/Topic"], 1, "::genom::no_such_outport"),
+    ],
+)
+def test_mistakes_on_the_command_line(world: World, arguments: list[str], code: int, message: str) -> None:
+    got, out, err = command(world, *arguments)
+    assert (got, out) == (code, "")
+    assert message in err and err.count("\n") == 1 and err.startswith("rosafe request: ")
+    assert names(world) == []
+
+
+def test_no_master(world: World) -> None:
+    uri = f"http://127.0.0.1:{harness.free_port()}"
+    done = world.graph.run("rosafe", "request", "ild", check=False, ROS_MASTER_URI=uri)
+    assert done.returncode == 1 and "start roscore first" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_without_sound(world: World) -> None:
+    """Rejected and interrupted requests without audio leave no processor, and the command prints the next step."""
+    with world.graph.node("bass-ros", "-i", "mute"), world.graph.node("rosAFE-ros", "-i", "deaf"):
+        refused = refusal(lambda: world.http.call("deaf/request", ["ild", {"connect": "mute/Audio"}]))
+        assert (refused.status, refused.ex) == (422, "::rosAFE::e_noData")
+        arguments = ("ild", "-i", "deaf", "--connect", "mute/Audio")
+        code, out, err = command(world, *arguments)
+        assert (code, out) == (1, "")
+        message = "rosafe request: ::rosAFE::e_noData: no audio on the Audio port; start the sound first: "
+        assert err.startswith(message) and err.count("\n") == 1
+        assert names(world, "deaf") == []
+        with world.graph.start("rosafe", "request", *arguments) as going:
+
+            def waiting() -> bool:
+                assert going.alive, going
+                return activities(world, "deaf") == ["InputProc"]
+
+            harness.wait_for(waiting)
+            os.kill(going.pid, signal.SIGINT)
+            assert "genom_success: True" in world.graph.run("sh", "-c", err.removeprefix(message)).stdout
+            assert going.wait() == 130, going
+            assert (going.out, going.err) == ("", "")
+        assert names(world, "deaf") == []
+        assert command(world, *arguments)[0] == 0
+        assert names(world, "deaf") == CHAIN

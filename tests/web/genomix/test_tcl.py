@@ -1,0 +1,762 @@
+"""The Tcl package in tclsh, with a real genomixd and real nodes."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+
+import pytest
+
+from tests import harness
+from tests.terminal import Terminal
+from tests.web.genomix import world as worlds
+from tests.web.genomix.world import World
+
+pytestmark = pytest.mark.ros
+
+LOAD = """
+set g [genomix::connect $address]
+$g load bass
+$g load rosAFE
+rosAFE::connect_port Audio bass/Audio
+"""
+TREE = (
+    LOAD
+    + """
+bass::Acquire scene:
+rosAFE::InputProc
+rosAFE::PreProc
+rosAFE::GammatoneProc {fb_nChannels 4}
+"""
+)
+
+
+# --- connections and components ---------------------------------------------------------------------------------
+
+
+def test_the_package_has_a_version_and_no_side_effects_at_load(world: World) -> None:
+    script = """
+        foreach name {byte character plain part root clients encoded} {set $name mine}
+        set before ""
+        set before [lsort [info globals]]
+        package forget genomix
+        namespace delete genomix
+        show [package require genomix] [namespace exists ::rosAFE] [after info] [lsort [file channels]]
+        show $byte $character $plain $part $root $clients $encoded [expr {[lsort [info globals]] eq $before}]
+        namespace import ::genomix::*
+        show [namespace origin connect] [namespace origin localhost]
+    """
+    assert world.lines(script) == [
+        "1.8|0||stderr stdin stdout",
+        "mine|mine|mine|mine|mine|mine|mine|1",
+        "::genomix::connect|::genomix::localhost",
+    ]
+
+
+def test_handles_are_commands_by_their_literal_names(world: World) -> None:
+    script = """
+        genomix::connect $address
+        show [set second [genomix::connect $address]]
+        show [genomix1 load bass] [$second load /opt/openrobots/lib/genom/ros/plugins/rosAFE.so]
+        genomix1 rpath ~/openrobots/lib/genom/ros/plugins/
+        show [bass::Stop] [info commands ::rosAFE::getSignals]
+        $second unload rosAFE
+        show [namespace exists ::rosAFE] [namespace exists ::bass]
+        genomix1 destroy
+        show [namespace exists ::bass] [info commands genomix1]
+    """
+    assert world.lines(script) == ["genomix2", "bass|rosAFE", "|::rosAFE::getSignals", "0|1", "0|"]
+
+
+def test_instances_and_aliases(world: World) -> None:
+    with world.graph.node("bass-ros", "-i", "left"):
+        script = """
+            set g [genomix::connect $address]
+            show [$g load bass -i left] [$g load bass -i left as ears] [$g load bass as right]
+            left::Acquire {device scene: nFramesPerChunk 700}
+            show [dict get [ears::Audio] Audio nFramesPerChunk] [dict get [left::Audio] Audio nFramesPerChunk]
+            show [dict exists [right::Audio] Audio]
+            left::kill
+        """
+        assert world.lines(script) == ["left|ears|right", "700|700", "1"]
+
+
+def test_every_service_and_port_is_a_command(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        foreach name {
+            InputProc getSignals getSignal Gammatone Ratemap CrossCorrelation kill abort_activity connect_service
+            ratemapProcPort genom_state Audio dataObj crossCorrelationPort
+        } {
+            if {[info commands ::rosAFE::$name] eq ""} {error "no $name"}
+        }
+        show [dict get [rosAFE::genom_state] genom_state task 0 name]
+    """
+    )
+    assert world.lines(script) == ["init"]
+
+
+def test_mistakes_at_connecting_and_loading(world: World) -> None:
+    port = harness.free_port()
+    script = f"""
+        show {{*}}[failure {{genomix::connect 127.0.0.1:{port}}}]
+        show [lindex [failure {{genomix::connect a:b:c}}] 1 1]
+        set g [genomix::connect $address]
+        show {{*}}[failure {{$g load nobody}}]
+        show [lindex [failure {{$g load bass -x y}}] 0]
+        show [lindex [failure {{$g load bass as genomix}}] 0]
+        show [lindex [failure {{$g load bass as {{a b}}}}] 0]
+        show [lindex [failure {{$g unload bass}}] 0]
+        show [lindex [failure {{bass::Stop}}] 0]
+    """
+    lines = world.lines(script)
+    what = f"no genomixd at 127.0.0.1:{port} (couldn't open socket: connection refused)"
+    assert lines[0] == f"ex ::genom::mwerr detail {{what {{{what}}}}}|GENOM ::genom::mwerr {{what {{{what}}}}}"
+    assert lines[1] == "::genom::serialization"
+    assert "GENOM ::genom::mwerr {what {nobody is not running: /nobody/connect_port is not registered}}" in lines[2]
+    assert 'got "-x"' in lines[3]
+    assert '"genomix" is not allowed as a namespace' in lines[4]
+    assert "as: expected a letter, followed by letters, digits and _" in lines[5]
+    assert 'got "bass"' in lines[6]
+    assert "invalid command name" in lines[7]
+
+
+# --- arguments --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name", "channels"),
+    [
+        ("{name g fb_nChannels 3}", "g", "3"),
+        ("{fb_nChannels 3\n    name   g}", "g", "3"),
+        ("g", "g", "31"),
+        ("g preProc", "g", "31"),
+        ("g preProc gammatone 80 8000 1 3", "g", "3"),
+        ("-- g preProc gammatone 80 8000 1 3", "g", "3"),
+        ("{}", "gammatone", "31"),
+        ("", "gammatone", "31"),
+        ("[dict create name g fb_nChannels 3]", "g", "3"),
+        ("[subst {name g fb_nChannels [expr {1+2}]}]", "g", "3"),
+        ("{fb_cfHz {100 200 300}}", "gammatone", "3"),
+        ("{fb_cfHz {0 100 1 200 2 300}}", "gammatone", "3"),
+        ("{fb_cfHz {2 300 0 100 1 200}}", "gammatone", "3"),
+        ("{fb_cfHz 440}", "gammatone", "1"),
+        ("{fb_cfHz {} fb_nChannels 3}", "gammatone", "3"),
+        ("g preProc gammatone 80 8000 1 0 {0 100 1 200 2 300}", "g", "3"),
+        ("g preProc gammatone 80 8000 1 0 {100 200 300} 4 1.018", "g", "3"),
+    ],
+)
+def test_argument_forms(world: World, arguments: str, name: str, channels: str) -> None:
+    script = (
+        LOAD
+        + f"""
+        bass::Acquire scene:
+        rosAFE::InputProc
+        rosAFE::PreProc
+        rosAFE::GammatoneProc {arguments}
+        set made [dict get [rosAFE::getParameters] parameters gammatone 0]
+        show [dict get $made name] [dict get $made fb_nChannels]
+    """
+    )
+    assert world.lines(script) == [f"{name}|{channels}"]
+
+
+@pytest.mark.parametrize(("text", "value"), [("0", "0"), ("1", "1"), ("true", "1"), ("no", "0"), ("F", "0")])
+def test_booleans(world: World, text: str, value: str) -> None:
+    script = (
+        LOAD
+        + f"""
+        bass::Acquire scene:
+        rosAFE::InputProc
+        rosAFE::PreProc {{pp_bRemoveDC {text}}}
+        show [dict get [rosAFE::getParameters] parameters preProc 0 pp_bRemoveDC]
+    """
+    )
+    assert world.lines(script) == [value]
+
+
+def test_the_result_of_one_call_is_the_argument_of_another(world: World) -> None:
+    script = (
+        TREE
+        + """
+        set parameters [dict get [rosAFE::getParameters] parameters gammatone 0]
+        dict set parameters name again
+        rosAFE::GammatoneProc $parameters
+        set both [dict get [rosAFE::getParameters] parameters gammatone]
+        show [dict size $both] [expr {[dict get $both 0 fb_cfHz] eq [dict get $both 1 fb_cfHz]}]
+    """
+    )
+    assert world.lines(script) == ["2|1"]
+
+
+@pytest.mark.parametrize(
+    ("command", "reported"),
+    [
+        (
+            "GammatoneProc {name g bogus 1}",
+            "GammatoneProc: expected a known parameter, got 'bogus'; GammatoneProc takes name (string), upperDepName",
+        ),
+        ("GammatoneProc {bogus 1}", "GammatoneProc: expected a known parameter, got 'bogus'"),
+        (
+            "GammatoneProc {fb_nERBs abc}",
+            "fb_nERBs: expected a finite number, got 'abc' (fb_nERBs is a double; above 0, at most 100)",
+        ),
+        ("GammatoneProc {fb_cfHz {1 x}}", "fb_cfHz is a sequence<double>"),
+        ("GammatoneProc {fb_nChannels 1.5}", "fb_nChannels: expected a whole number, got 1.5"),
+        ("PreProc {pp_bRemoveDC 2}", "pp_bRemoveDC: expected a boolean, got '2'"),
+        ("GammatoneProc {name g fb_nERBs}", "expected a value for fb_nERBs"),
+        ("getDependencies a b c", "expected at most 1 arguments (nameProc), got 3"),
+        ("Stop now", "expected at most 0 arguments (no parameters), got 1"),
+        ("connect_port", "local is missing; connect_port takes local (string), remote (string)"),
+        ("connect_port Audio", "remote is missing"),
+        ("abort_activity -1x", 'expected a switch (-help, -send, -ack, -oneway, --), got "-1x"'),
+        ("abort_activity -- -1", "activity: expected a number in the range of unsigned long, got -1"),
+        ("abort_activity -1", "activity: expected a number in the range of unsigned long, got -1"),
+        ("GammatoneProc -what g", 'got "-what"'),
+        ("ildPort a b", "expected at most one element, got 2 arguments"),
+    ],
+)
+def test_refused_arguments_are_named(world: World, command: str, reported: str) -> None:
+    script = (
+        LOAD
+        + f"""
+        lassign [failure {{rosAFE::{command}}}] message code
+        show [dict get $message ex]
+        show [dict get $message detail what]
+        show [expr {{$code eq [list GENOM [dict get $message ex] [dict get $message detail]]}}]
+        lassign [failure {{rosAFE::{command} &}}] message code
+        show [dict get $message detail what]
+    """
+    )
+    ex, what, same, background = world.lines(script)
+    assert ex == "::genom::serialization"
+    assert reported in what
+    assert same == "1"
+    assert reported in background
+
+
+def test_special_characters_arrive_unchanged_and_are_not_evaluated(world: World) -> None:
+    script = (
+        LOAD
+        + r"""
+        foreach text [list {[exit 3]} "a\nb" "quote\"d" {\\} "t\tab" "\u00e9\u4e2d" {$x} "{" "}" { lead} "\x01"] {
+            lassign [failure {bass::Acquire [dict create device $text]}] message
+            show [dict get $message ex] [lindex [failure {rosAFE::getDependencies [list nameProc $text]}] 1 1]
+        }
+        bass::Acquire scene:
+        rosAFE::InputProc
+        set change {nameProc input nameParam in_doNormalize newValue {[exit 3]}}
+        lassign [failure {rosAFE::modifyParameter $change}] message
+        show [dict get $message ex] [string match {*\[exit 3\]*} [dict get $message detail what]]
+    """
+    )
+    lines = world.lines(script)
+    assert lines[:-1] == ["::bass::e_device|::rosAFE::e_noSuchProcessor"] * 11
+    assert lines[-1] == "::rosAFE::e_badNewValue|1"
+
+
+# --- results and errors -----------------------------------------------------------------------------------------
+
+
+def test_results_are_dicts_with_indexed_sequences(world: World) -> None:
+    script = (
+        TREE
+        + """
+        show [rosAFE::getDependencies gammatone]
+        show [rosAFE::Stop] [bass::Stop]
+        show [dict keys [rosAFE::getSignals {}]] [dict keys [dict get [rosAFE::getSignal] signals]]
+        show [rosAFE::dataObj]
+    """
+    )
+    assert world.lines(script) == [
+        "dependencies {0 input 1 preProc 2 gammatone}",
+        "|",
+        "signals|input preProc gammatone ihc ild ratemap crossCorrelation",
+        "dataObj {input {} preProc {} gammatone {} ihc {} ild {} ratemap {} crossCorrelation {}}",
+    ]
+
+
+def test_numbers_are_those_of_the_node(world: World) -> None:
+    """A port has the same numbers in Tcl and in JSON."""
+    script = (
+        TREE
+        + """
+        while {[dict get [rosAFE::preProcPort preProc] preProcPort lastFrameIndex] == 0} {after 20}
+        bass::Stop
+        set port [dict get [rosAFE::gammatonePort gammatone] gammatonePort]
+        show [dict get $port numberOfChannels] [dict size [dict get $port left dataN 0 data]]
+        show {*}[lrange [dict values [dict get $port right dataN 3 data]] end-99 end]
+    """
+    )
+    head, numbers = world.lines(script)
+    assert head == "4|44100"
+    port = world.http.call("rosAFE/gammatonePort/gammatone")["gammatonePort"]
+    expected = port["right"]["dataN"][3]["data"][-100:]
+    assert [float(number) for number in numbers.split("|")] == expected
+    assert any(expected)
+
+
+def test_errors_of_the_component(world: World) -> None:
+    script = (
+        TREE
+        + """
+        show {*}[failure {rosAFE::removeProcessor nobody}]
+        lassign [failure {rosAFE::GammatoneProc {name h fb_nERBs -1}}] message code
+        show [dict get $message ex] [dict get $message detail what]
+        show [lrange $code 0 1]
+        try {rosAFE::PreProc} trap {GENOM ::rosAFE::e_existsAlready} message {show trapped $message}
+    """
+    )
+    assert world.lines(script) == [
+        "ex ::rosAFE::e_noSuchProcessor what {there is no processor 'nobody'; there are: input, preProc, gammatone}"
+        "|GENOM ::rosAFE::e_noSuchProcessor {}",
+        "::rosAFE::e_badNewValue|fb_nERBs: expected a number above 0, at most 100, got -1",
+        "GENOM ::rosAFE::e_badNewValue",
+        "trapped|ex ::rosAFE::e_existsAlready what {'preProc' exists already, of kind preProc}",
+    ]
+
+
+def test_one_representation_is_smaller_than_all_of_them(world: World) -> None:
+    """A second of a full tree of 31 channels is 160 MB of text (here an eighth of that); of ILD or ratemap, little."""
+    script = (
+        LOAD
+        + """
+        bass::Acquire scene:
+        rosAFE::request ild {fb_nChannels 4}
+        rosAFE::request ratemap {fb_nChannels 4}
+        while {![dict exists [rosAFE::ildPort ild_0] ildPort lastFrameIndex]
+            || [dict get [rosAFE::ildPort ild_0] ildPort lastFrameIndex] < 50000} {after 20}
+        foreach name {ild_0 ratemap_0} {show [string length [rosAFE::getRepresentation $name]]}
+        show [string length [rosAFE::getSignals]]
+    """
+    )
+    # in less than a minute: the time of getSignals grows as its length, not as the square of that
+    *some, everything = map(int, world.lines(script, timeout=harness.PATIENCE))
+    assert all(5_000 < length < everything / 100 for length in some), some
+    assert everything > 15e6
+
+
+# --- requests in the background ---------------------------------------------------------------------------------
+
+
+def test_a_request_lasts_as_long_as_its_activity(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        set r [bass::Acquire {device scene:} &]
+        show [string match bass::* [$r id]] [$r status] [$r wait 300]
+        show [lindex [failure {$r result}] 1 1]
+        bass::Stop
+        show [$r wait] [$r status] [$r result]
+        $r clean
+        show [info commands $r]
+    """
+    )
+    assert world.lines(script) == ["1|sent|sent", "::genomix::e_notDone", "done|done|", ""]
+
+
+def test_abort(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        set r [bass::Acquire -ack scene:]
+        show [$r status]
+        $r abort
+        show [$r wait 60000]
+        $r abort
+        show [$r status]
+    """
+    )
+    assert world.lines(script) == ["sent", "done", "done"]
+
+
+def test_a_request_that_fails(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        set r [bass::Acquire {device file:/none.wav} &]
+        show [$r wait]
+        lassign [failure {$r result}] message code
+        show [dict get $message ex] [lrange $code 0 1]
+        set r [rosAFE::GammatoneProc -ack {}]
+        show [$r status] [dict get [lindex [failure {$r result}] 0] ex]
+    """
+    )
+    assert world.lines(script) == [
+        "error",
+        "::bass::e_device|GENOM ::bass::e_device",
+        "error|::rosAFE::e_noUpperDependencie",
+    ]
+
+
+def test_only_the_first_status_of_the_end_counts(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        set r [rosAFE::getProcessors &]
+        show [$r wait]
+        set result [$r result]
+        show [$r update {status error exception {ex ::genom::late}}]
+        show [$r status] [expr {[$r result] eq $result}] [after info]
+    """
+    )
+    assert world.lines(script) == ["done", "0", "done|1|"]
+
+
+def test_callbacks_on_success_and_error_in_the_event_loop(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        proc done {args} {
+            set request [lindex $args end]
+            lappend ::log [lrange $args 0 end-1] [$request status] [catch {$request result} result]
+            lappend ::log [dict get $result {*}$::key]
+            incr ::count
+        }
+        proc bgerror {message} {lappend ::log $message; incr ::count}
+        set count 0
+        set key dependencies
+        bass::Acquire scene: &
+        rosAFE::InputProc
+        rosAFE::getDependencies input & done first {second arg}
+        show [info exists log]
+        while {$count < 1} {vwait count}
+        show $log
+        set log {}
+        set key ex
+        set r [rosAFE::removeProcessor nobody & done]
+        while {[$r status] eq "sent"} {after 10}
+        show [info exists ::result] $count
+        update
+        show $log
+        set log {}
+        rosAFE::getDependencies input & error oops
+        while {$count < 3} {vwait count}
+        show [string match "*wrong # args*" $log]
+        rosAFE::inputProcPort & done
+        while {$count < 4} {vwait count}
+    """
+    )
+    assert world.lines(script) == [
+        "0",
+        "{first {second arg}} done 0 {0 input}",
+        "0|1",
+        "{} error 1 ::rosAFE::e_noSuchProcessor",
+        "0",
+    ]
+
+
+def test_requests_in_the_background(world: World) -> None:
+    script = (
+        TREE
+        + """
+        foreach command {
+            {rosAFE::getParameters &}
+            {::rosAFE::getDependencies {nameProc gammatone} &}
+            {::rosAFE::getSignals {} &}
+            {::rosAFE::preProcPort preProc &}
+            {rosAFE::genom_state -s &}
+            {rosAFE::getDependencies -s {nameProc input} &}
+            {rosAFE::getDependencies -s {nameProc input}}
+            {rosAFE::getParameters -ack}
+            {rosAFE::getParameters -a}
+        } {
+            set r [eval $command]
+            show [$r wait] [dict keys [$r result]]
+        }
+        show [rosAFE::removeProcessor -oneway gammatone] [rosAFE::Stop -o]
+    """
+    )
+    assert world.lines(script) == [
+        "done|parameters",
+        "done|dependencies",
+        "done|signals",
+        "done|preProcPort",
+        "done|genom_state",
+        "done|dependencies",
+        "done|dependencies",
+        "done|parameters",
+        "done|parameters",
+        "|",
+    ]
+
+
+def test_requests_go_in_order(world: World) -> None:
+    """A tree is requested without pauses, as in scripts."""
+    script = (
+        LOAD
+        + """
+        bass::Acquire scene: &
+        rosAFE::InputProc &
+        rosAFE::PreProc &
+        rosAFE::GammatoneProc {fb_nChannels 2} &
+        rosAFE::IhcProc &
+        set last [rosAFE::IldProc -ack]
+        show [$last status] [rosAFE::getDependencies ild]
+    """
+    )
+    assert world.lines(script) == ["sent|dependencies {0 input 1 preProc 2 gammatone 3 ihc 4 ild}"]
+
+
+def test_a_script_that_ends_does_not_hang(world: World) -> None:
+    script = LOAD + "bass::Acquire scene: & \nrosAFE::getParameters &\nset r [bass::Stop &]\n"
+    assert world.tcl(script).returncode == 0
+    done = world.tcl(LOAD + "bass::Acquire {device none}\n", check=False)
+    assert done.returncode == 1
+    assert "ex ::bass::e_device" in done.stderr
+
+
+def test_a_server_that_restarts(world: World) -> None:
+    script = world.graph.home / "gone.tcl"
+    script.write_text("""
+        package require genomix
+        set g [genomix::connect [lindex $argv 0]]
+        $g load bass as ears
+        set r [ears::Acquire -ack scene:]
+        proc say {args} {puts [join $args |]; flush stdout; gets stdin}
+        say ready
+        say [$r wait 60000] [catch {$r result} message] $message
+        say [catch {ears::Stop} message] $message
+        say back [ears::Stop] [[ears::genom_state &] wait]
+    """)
+    with worlds.genomixd(world.graph) as (process, port):
+        command = ["tclsh", str(script), f"127.0.0.1:{port}"]
+        with subprocess.Popen(
+            command, env=world.graph.env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as client:
+            assert client.stdin is not None
+            assert client.stdout is not None
+            assert client.stdout.readline() == "ready\n"
+            process.stop()
+            print(file=client.stdin, flush=True)
+            lost = client.stdout.readline()
+            assert lost.startswith("error|1|ex ::genom::mwerr detail {what {the connection to genomixd at")
+            print(file=client.stdin, flush=True)
+            assert client.stdout.readline().startswith("1|ex ::genom::mwerr detail {what {no genomixd at 127.0.0.1:")
+            with world.graph.start(str(harness.SCRIPTS / "genomixd"), "-v", "-p", str(port)) as again:
+                assert worlds.port_of(again) == port
+                print(file=client.stdin, flush=True)
+                assert client.stdout.readline() == "back||done\n"
+                client.stdin.close()
+                assert client.wait() == 0
+
+
+def test_localhost_starts_a_private_server_that_ends_with_the_shell(world: World) -> None:
+    script = """
+        set g [genomix::localhost]
+        set h [genomix::localhost]
+        show $g $h [$g load bass] [bass::Stop] [pid [lindex $genomix::private 0]]
+        set r [bass::Acquire scene: &]
+        show [$r wait 100]
+    """
+    first, second = world.lines(script)
+    assert first.startswith("genomix1|genomix2|bass||")
+    assert second == "sent"
+    pid = int(first.rsplit("|", 1)[1])
+    harness.wait_for(lambda: not harness.proc(pid).exists(), what=f"end of the private server {pid}")
+
+
+# --- help -------------------------------------------------------------------------------------------------------
+
+
+def test_help_has_types_defaults_ranges_and_texts(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        puts [rosAFE::PreProc -h]
+        puts [rosAFE::connect_port -help]
+        puts [rosAFE::ildPort -h]
+        puts [bass::Stop -h]
+    """
+    )
+    reported = world.tcl(script).stdout
+    for line in (
+        "rosAFE::PreProc: Condition the input",
+        "  pp_bRemoveDC (boolean, default 0): Flag to activate the DC-removal high-pass filter",
+        "  pp_refSPLdB (double, default 100.0, from -200 to 400): Reference dB SPL value",
+        "  pp_middleEarModel (string, default jepsen, one of jepsen, lopezpoveda):",
+        "  may fail with ::rosAFE::e_noUpperDependencie",
+        "  local (string, no default): Name of this component's input port",
+        "rosAFE::ildPort element: Interaural level differences",
+        "bass::Stop: Stop the acquisition\n  no parameters",
+    ):
+        assert line in reported
+    assert "invalid command name" in world.lines(LOAD + "show [lindex [failure {rosAFE::noSuch -h}] 0]\n")[0]
+
+
+# --- the slips of the guide -------------------------------------------------------------------------------------
+
+
+def test_errors_of_the_guide_are_accepted(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        bass::Acquire scene:
+        rosAFE::InputProc
+        rosAFE::PreProc {pp_refSPLdBS 90 pp_middleEarModel jespen}
+        rosAFE::Gammatone {fb_nChannels 2}
+        rosAFE::IhcProc
+        rosAFE::Ratemap
+        rosAFE::CrossCorrelation
+        set made [dict get [rosAFE::getParameters] parameters]
+        show [dict get $made preProc 0 pp_refSPLdB] [dict get $made preProc 0 pp_middleEarModel]
+        show [dict keys [rosAFE::getSignal]] [dict keys [rosAFE::ratemapProcPort ratemap]]
+        show [dict keys [rosAFE::inputProcPort input]] [dict keys [rosAFE::crossCorrelationPort crossCorrelation]]
+        :: rosAFE :: modifyParameter {nameProc preProc nameParam pp_bRemoveDC newValue 1}
+        show [dict get [rosAFE::getParameters] parameters preProc 0 pp_bRemoveDC]
+        rosAFE::removeProcessor {nameProc ratemap}
+        rosAFE::removeProcessor {name ihc}
+        show [dict size [dict get [rosAFE::getParameters] parameters ihc]]
+        show [lindex [failure {:: nobody :: here}] 0]
+    """
+    )
+    assert world.lines(script) == [
+        "90.0|jepsen",
+        "signals|ratemapPort",
+        "inputProcPort|crossCorrelationPort",
+        "1",
+        "0",
+        'invalid command name "::"',
+    ]
+
+
+# --- messages for users --------------------------------------------------------------------------------------
+
+
+def test_a_slow_answer_is_reported_on_a_terminal(world: World) -> None:
+    """A line that appears and disappears; in a pipe there is none."""
+    script = world.graph.home / "long.tcl"
+    script.write_text(
+        f"""
+        package require genomix
+        set g [genomix::connect 127.0.0.1:{world.port}]
+        $g load rosAFE
+        foreach ::genomix::http::progressDelay {{0 100000}} {{
+            set port [rosAFE::gammatonePort gammatone]
+            puts "got [dict get $port gammatonePort numberOfChannels]"
+        }}
+        """,
+        "utf-8",
+    )
+    world.tcl(TREE)
+    with Terminal(["tclsh", str(script)], world.graph.env) as terminal:
+        shown = terminal.expect("got 4")
+        assert re.search(r"rosAFE::gammatonePort: \d+\.\d MB in \d s", shown)
+        assert "\r\x1b[Kgot 4" in terminal.sent.replace("\r\n", "\n")  # it is gone
+        assert "MB" not in terminal.expect("got 4")
+        assert terminal.end() == 0
+    done = world.graph.run("tclsh", str(script))
+    assert (done.stdout.split(), done.stderr) == (["got", "4"] * 2, "")
+
+
+def test_background_errors_are_reported_in_one_line(world: World) -> None:
+    """Unread errors are reported once, by the background error handler of the script."""
+    script = (
+        LOAD
+        + """
+        set change {nameProc nobody nameParam x newValue 1}
+        proc pass {ms} {after $ms {set ::past 1}; vwait ::past}
+        rosAFE::modifyParameter $change &
+        rosAFE::preProcPort dummyName &
+        bass::Stop &
+        pass 1500
+        # A script that reads the error gets no second report.
+        set r [rosAFE::modifyParameter $change &]
+        show [$r wait]
+        set r [rosAFE::modifyParameter $change &]
+        while {[$r status] eq "sent"} {update; after 10}
+        show [rosAFE::modifyParameter -ack $change] [catch {rosAFE::modifyParameter $change}]
+        show [::genomix::request6 status]
+        set r [rosAFE::modifyParameter $change & list]
+        set r [rosAFE::modifyParameter $change &]
+        $r wait 0
+        $r clean
+        pass 1500
+        proc bgerror {message} {show $message $::errorInfo $::errorCode; set ::told 1}
+        rosAFE::modifyParameter $change &
+        vwait told
+        pass 1000
+    """
+    )
+    done = world.tcl(script)
+    ex = "::rosAFE::e_noSuchProcessor"
+    message = f"rosAFE::modifyParameter &: {ex}: there is no processor 'nobody'; there are: none"
+    assert done.stdout.splitlines() == [
+        "error",
+        "::genomix::request6|1",
+        "error",
+        f"{message}|{message}|GENOM {ex} {{}}",
+    ]
+    missing = "preProcPort has no element 'dummyName'; there are: none"
+    assert sorted(done.stderr.splitlines()) == [message, f"rosAFE::preProcPort &: ::genom::no_such_outport: {missing}"]
+
+
+def test_background_errors_are_reported_at_the_prompt_of_tclsh(world: World) -> None:
+    """tclsh handles no events while it waits for a line: errors are reported with the next request, and once."""
+    with Terminal(["tclsh"], world.graph.env) as terminal:
+
+        def types(line: str) -> str:
+            terminal.press(f"{line}\n")
+            return terminal.expect("\n% ")
+
+        terminal.expect("% ")
+        types("package require genomix")
+        types(f"set g [genomix::connect 127.0.0.1:{world.port}]; $g load rosAFE")
+        types("set ::genomix::reportDelay 0")
+        types("rosAFE::modifyParameter nobody x 1 &")
+        types("$g load rosAFE; after 100")
+        reported = types("set looked [rosAFE::removeProcessor nobody2 &]")
+        assert "rosAFE::modifyParameter &: ::rosAFE::e_noSuchProcessor: there is no processor 'nobody'" in reported
+        assert "error" in types("$looked wait")
+        assert "&:" not in types("rosAFE::getProcessors") and "&:" not in types("rosAFE::getProcessors")
+
+
+def test_a_lost_server_is_reported_once(world: World) -> None:
+    with worlds.genomixd(world.graph) as (server, port):
+        script = world.graph.home / "lost.tcl"
+        script.write_text(f"""
+            package require genomix
+            set g [genomix::connect 127.0.0.1:{port}]
+            $g load bass
+            $g load rosAFE
+            rosAFE::connect_port Audio bass/Audio
+            bass::Acquire -ack scene:
+            rosAFE::InputProc -ack {{}}
+            rosAFE::PreProc -ack {{}} & list
+            puts ready
+            flush stdout
+            after 30000 {{set past 1}}
+            proc bgerror {{message}} {{puts $message; after 1000 {{set ::past 1}}}}
+            vwait past
+        """)
+        with world.graph.start("tclsh", str(script)) as client:
+            harness.wait_for(lambda: "ready" in client.out, what=lambda: repr(client))
+            server.stop()
+            assert client.wait() == 0
+            reported = f"::genom::mwerr: the connection to genomixd at 127.0.0.1:{port} is lost"
+            assert client.out.splitlines() == ["ready", f"bass::Acquire &: {reported}"]
+            assert client.err == ""
+
+
+def test_the_default_of_the_highest_channel_depends_on_the_sample_rate_everywhere(world: World) -> None:
+    """Without it: Tcl, one request for the whole tree, which reuses its processors, and plain services."""
+    script = (
+        LOAD
+        + """
+        bass::Acquire {device scene: sampleRate 16000}
+        rosAFE::InputProc
+        rosAFE::PreProc
+        rosAFE::GammatoneProc {fb_nChannels 5}
+        show [dict get [rosAFE::request gammatone {fb_nChannels 6}] name]
+        show [dict get [rosAFE::request gammatone {fb_nChannels 6}] name]
+        catch {rosAFE::GammatoneProc {name other fb_nChannels 5 fb_highFreqHz 8000}} result
+        show $result
+    """
+    )
+    *names, refusal = world.lines(script)
+    assert names == ["filterbank_0", "filterbank_0"]
+    assert "use at most 7600 Hz" in refusal
+    world.graph.run("rosservice", "call", "/rosAFE/GammatoneProc", "{name: plain, fb_nChannels: 7}")
+    reported = world.graph.run("rosservice", "call", "/rosAFE/getParameters", "{}").stdout
+    assert re.findall("fb_highFreqHz: (.*)", reported) == ["7600.0"] * 3
