@@ -373,7 +373,7 @@ def test_hdf5_with_references_to_other_files(tmp_path: Path, good: Path, name: s
 
 def test_hdf5_cannot_open_other_files(good: Path) -> None:
     program = (
-        "import os; from rosafe.processing import isolated\n"
+        "import os; from rosafe.results import isolated\n"
         "kept = isolated.open_h5(os.open(os.environ['FILE'], os.O_RDONLY))\n"
         "try: open('/etc/hostname')\nexcept OSError as problem: print(problem.errno)"
     )
