@@ -12,8 +12,8 @@ from rosafe.interface.arguments import is_parameter
 PRESETS: dict[str, dict[str, Any]] = {
     "speech": {
         "ac_wSizeSec": 0.07,
-        "ac_K": 0.8,
-        "pi_rangeHz": [60.0, 400.0],
+        "ac_K": 1.0,
+        "pi_rangeHz": [75.0, 420.0],
         "pi_confThres": 0.15,
         "pi_medianOrder": 7,
         "pi_peakRatio": 0.9,

@@ -20,14 +20,16 @@ from rosafe.dsp.stage import Stage
 
 CONFIDENCE_SECONDS = 5.0  # time over which the greatest confidence is determined
 MAX_ORDER = 99  # of the median
+HALF_TOLERANCE = 0.03  # about 50 cents, of the lag; at least one sample
 
 
 class Pitch(Stage):
     """Fundamental frequency, (2, C, L, F) to (2, 3, F): rows pitch (Hz or NaN), rawPitch (Hz or 0), confidence.
 
     1. s[l] = mean over channels of the autocorrelation, for 1 / pi_rangeHz[1] <= l / fs <= 1 / pi_rangeHz[0]
-    2. rawPitch = fs / l and confidence = s[l] at the first peak of s within that range that is at least pi_peakRatio
-       times as high as the highest one; the peak of a plateau is at its middle; both are 0 if no peak is above 0
+    2. rawPitch = fs / l and confidence = s[l] at the highest peak of s within that range, or at a peak at half of its
+       lag (within HALF_TOLERANCE) that is at least pi_peakRatio times as high; the peak of a plateau is at its middle;
+       both are 0 if no peak is above 0
     3. q[k] = rawPitch[k], or 0 if confidence[k] is below pi_confThres times the greatest confidence of the last 5 s
     4. pitch[k] = median of q[k - floor(n/2)] to q[k + ceil(n/2) - 1], n = pi_medianOrder; q is 0 before the first frame
 
@@ -81,7 +83,7 @@ class Pitch(Stage):
                 "pi_peakRatio",
                 "double",
                 1.0,
-                "Height of the first peak that counts, relative to the highest; below 1: fewer octaves below the pitch",
+                "Least height of a peak at half the lag of the highest, relative to it, that is used in its place",
                 0.0,
                 1.0,
                 open_minimum=True,
@@ -91,7 +93,7 @@ class Pitch(Stage):
         references=(
             Citation(MEDDIS_1997, "sum of the autocorrelations of all channels"),
             Citation(SLANEY_1990, "peak of the sum"),
-            Citation(MCLEOD_2005, "first peak above a part of the highest"),
+            Citation(MCLEOD_2005, "peak at a shorter lag, from a part of the height of the highest"),
         ),
     )
     INPUT = ("ear", "channel", "lag", "time")
@@ -122,8 +124,9 @@ class Pitch(Stage):
         summary = correlations[:, :, self._range].sum(axis=1) / channels
         arriving = np.zeros((len(summary), 3, summary.shape[-1]))
         chosen, raw, confidence = arriving[:, 0], arriving[:, 1], arriving[:, 2]
-        lag, confidence[:] = first_high_peak(np.ascontiguousarray(summary.swapaxes(1, 2)), self.values["pi_peakRatio"])
-        np.divide(self.sample_rate, lag + self._range.start, out=raw, where=confidence > 0)
+        curves = np.ascontiguousarray(summary.swapaxes(1, 2))
+        lag, confidence[:] = period_peak(curves, self._range.start, self.values["pi_peakRatio"])
+        np.divide(self.sample_rate, lag, out=raw, where=confidence > 0)
         self._confidences, greatest = running_maximum(self._confidences, confidence, self._reach)
         np.copyto(chosen, raw, where=confidence >= self.values["pi_confThres"] * greatest)
         return self._emit(arriving)
@@ -178,28 +181,39 @@ class Pitch(Stage):
         self._reach = max(1, round_half_away(CONFIDENCE_SECONDS * self.input_format.rate))  # frames
 
 
-def first_high_peak(curves: FloatArray, ratio: float) -> tuple[NDArray[np.int64], FloatArray]:
-    """Return index and height of a peak of each of curves (..., n), n >= 3; the height is 0 without a peak.
+def period_peak(curves: FloatArray, first_lag: int, ratio: float) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return lag and height of a peak of each of curves (..., n), n >= 3; the height is 0 without a peak.
 
-    It is the first one that is at least `ratio` times as high as the highest. A plateau is one peak at its middle,
-    rounded down. The ends and values below 0 do not count as peaks.
+    It is the highest one, the first of equals, or the highest at half of its lag if that is at least `ratio` times as
+    high. A plateau is one peak at its middle, rounded down. The ends and values below 0 do not count as peaks. The
+    curves begin at `first_lag`.
     """
+    heights, lags = _peaks(curves)
+    lags = lags + first_lag
+    highest = heights.argmax(axis=-1)[..., np.newaxis]
+    top, lag = np.take_along_axis(heights, highest, axis=-1), np.take_along_axis(lags, highest, axis=-1)
+    if ratio < 1:
+        usable = (heights >= ratio * top) & (np.abs(2 * lags - lag) <= np.maximum(1, HALF_TOLERANCE * lag))
+        halves = np.where(usable, heights, -np.inf)
+        half = halves.argmax(axis=-1)[..., np.newaxis]
+        found = np.take_along_axis(usable, half, axis=-1)
+        lag = np.where(found, np.take_along_axis(lags, half, axis=-1), lag)
+        top = np.where(found, np.take_along_axis(heights, half, axis=-1), top)
+    return lag[..., 0], np.maximum(top[..., 0], 0.0)
+
+
+def _peaks(curves: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Return the heights of the peaks of curves (..., n), (..., n - 2) and -inf elsewhere, and the index of each."""
     inner, after = curves[..., 1:-1], curves[..., 2:]
     tops = (inner > curves[..., :-2]) & (inner >= after)
-    if not (tops & (inner == after)).any():  # no plateaus: the usual case
-        first, height = _first_of(np.where(tops, inner, -np.inf), ratio)
-        return first + 1, np.maximum(height, 0.0)
-    return _first_of_plateaus(curves, ratio)
+    if (tops & (inner == after)).any():
+        return _peaks_and_plateaus(curves)
+    heights = np.where(tops, inner, -np.inf)
+    return heights, np.broadcast_to(np.arange(1, curves.shape[-1] - 1), heights.shape)
 
 
-def _first_of(heights: FloatArray, ratio: float) -> tuple[NDArray[np.int64], FloatArray]:
-    """Return index and value of the first of heights (..., n) that is at least `ratio` times the highest."""
-    first = (heights >= ratio * heights.max(axis=-1, keepdims=True)).argmax(axis=-1)
-    return first, np.take_along_axis(heights, first[..., np.newaxis], axis=-1)[..., 0]
-
-
-def _first_of_plateaus(curves: FloatArray, ratio: float) -> tuple[NDArray[np.int64], FloatArray]:
-    """Compute `first_high_peak` of curves that may have plateaus or no peak."""
+def _peaks_and_plateaus(curves: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Compute `_peaks` of curves that may have plateaus."""
     here, following = curves[..., :-1], curves[..., 1:]
     rises = following > here
     number = 2 * np.arange(curves.shape[-1])
@@ -208,9 +222,7 @@ def _first_of_plateaus(curves: FloatArray, ratio: float) -> tuple[NDArray[np.int
     steps = np.minimum.accumulate(steps[..., ::-1], axis=-1)[..., ::-1][..., 1:]
     peaks = rises[..., :-1] & (steps & 1 == 1)
     heights = np.where(peaks, following[..., :-1], -np.inf)
-    begin, height = _first_of(heights, ratio)
-    end = np.take_along_axis(steps, begin[..., np.newaxis], axis=-1)[..., 0] // 2
-    return (begin + 1 + end) // 2, np.maximum(height, 0.0)
+    return heights, (number[1:-1] // 2 + steps // 2) // 2
 
 
 def running_maximum(before: FloatArray, values: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:
