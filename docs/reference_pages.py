@@ -308,9 +308,9 @@ $K = 2$ is the ordinary autocorrelation; $K < 2$ compresses the spectrum. Silenc
     ),
     "pitch": Page(
         "Pitch",
-        r"""The lag $l$ is the highest peak of the mean $s$ of the autocorrelations $A_c$ of all $C$ channels, within the
-range `pi_rangeHz`. If $s$ has a peak at half of this lag (within 3 %, at least one sample) that is at least `pi_peakRatio`
-times as high, $l$ is the lag of that peak. The ends of the range are not peaks.
+        r"""The lag $l$ is the highest peak of the mean $s$ of the autocorrelations $A_c$ of all $C$ channels, in the
+range `pi_rangeHz`. If `pi_peakRatio` is below 1 and $s$ has a peak at half of this lag (within 3 % or one sample) that
+is at least `pi_peakRatio` times as high, $l$ is the lag of that peak. The ends of the range are not peaks.
 
 $$s[l] = \frac{1}{C} \sum_c A_c[l], \qquad f_0 = \frac{f_s}{l}, \qquad \text{confidence} = s[l]$$
 

@@ -37,8 +37,9 @@ purpose.
 
 `speech`: the pitch of voices from 80 to 400 Hz, at sample rates from 16 kHz. `pi_rangeHz` is wider because its ends are
 not found. Share of frames within 50 cents for 288 synthetic vowels (random formants, four glottal pulses, fixed and
-gliding pitch, jitter, without noise and at 20, 10 and 5 dB, 16 kHz; the values were chosen with others), beside a window of 60 ms with `ac_K` = 2,
-`pi_rangeHz` = 60, 400, `pi_confThres` = 0.2 and `pi_peakRatio` = 1, and beside `librosa.pyin` with windows of 64 ms:
+gliding pitch, jitter, without noise and at 20, 10 and 5 dB, 16 kHz; the values were chosen with others), beside a
+window of 60 ms with `ac_K` = 2, `pi_rangeHz` = 60, 400, `pi_confThres` = 0.2 and `pi_peakRatio` = 1, and beside
+`librosa.pyin` with windows of 64 ms:
 
 | pitch (Hz) | 80 to 120 | 120 to 180 | 180 to 250 | 250 to 300 | 300 to 350 | 350 to 395 |
 | --- | --- | --- | --- | --- | --- | --- |

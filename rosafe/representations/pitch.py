@@ -20,7 +20,7 @@ from rosafe.dsp.stage import Stage
 
 CONFIDENCE_SECONDS = 5.0  # time over which the greatest confidence is determined
 MAX_ORDER = 99  # of the median
-HALF_TOLERANCE = 0.03  # about 50 cents, of the lag; at least one sample
+HALF_TOLERANCE = 0.03  # part of the lag, about 50 cents, for twice the shorter lag; at least one sample
 
 
 class Pitch(Stage):

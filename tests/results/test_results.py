@@ -331,24 +331,34 @@ def test_the_preset_for_speech_on_high_voices(frequency: int, formants: tuple[in
     assert np.mean(np.abs(cents) <= 50) >= 0.95
 
 
-@pytest.mark.parametrize("low, high", [(80, 120), (120, 180), (180, 250), (250, 300), (300, 350), (350, 395)])
+def glottal_vowel(rng: np.random.Generator, low: float, high: float, snr: float) -> tuple[np.ndarray, np.ndarray]:
+    """A glide of glottal pulses with jitter and shimmer through random formants, in noise, and its pitch."""
+    begin, end = rng.uniform(low, high, 2)
+    pitch = np.geomspace(begin, end, int(0.4 * RATE))
+    cycles = np.cumsum(pitch) / RATE
+    cycles += np.interp(cycles, np.arange(200), 0.01 * rng.standard_normal(200))
+    opened = cycles % 1 / rng.uniform(0.4, 0.8)
+    flow = np.where(opened < 1, opened**2 - opened**3, 0.0) * rng.normal(1, 0.05, 200)[cycles.astype(int)]
+    sound = np.diff(flow, prepend=0)
+    for formant in (rng.uniform(250, 900), rng.uniform(950, 2300), rng.uniform(2500, 3400)):
+        radius = np.exp(-np.pi * rng.uniform(50, 150) / RATE)
+        sound = scipy.signal.lfilter([1], [1, -2 * radius * np.cos(2 * np.pi * formant / RATE), radius**2], sound)
+    sound = sound / sound.std() + 10 ** (-snr / 20) * rng.standard_normal(len(sound))
+    return 0.1 * sound, pitch
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(80, 120), (120, 180), (180, 250), (250, 300), (300, 350), (350, 395), (395, 400)]
+)
 def test_the_preset_for_speech_on_random_vowels(low: int, high: int) -> None:
-    """Random formants, sources, glides and jitter, in noise of 20 and 10 dB: at least 98 % within 50 cents."""
+    """At least 97 % of the frames are within 50 cents, at 20 and 10 dB."""
     rates = []
-    for seed in range(6):
-        rng = np.random.default_rng([low, seed])
-        begin, end = rng.uniform(low, high, 2)
-        pitch = np.geomspace(begin, end, int(0.4 * RATE))
-        phase = np.cumsum(pitch * (1 + 0.01 * rng.standard_normal(80).repeat(len(pitch) // 80))) / RATE
-        sound = sum(np.cos(2 * np.pi * n * phase) / n ** rng.uniform(0.3, 1.2) for n in range(1, int(7000 / high)))
-        for formant in (rng.uniform(250, 900), rng.uniform(950, 2300), rng.uniform(2500, 3400)):
-            radius = np.exp(-np.pi * rng.uniform(50, 150) / RATE)
-            sound = scipy.signal.lfilter([1], [1, -2 * radius * np.cos(2 * np.pi * formant / RATE), radius**2], sound)
-        noise = rng.standard_normal(len(sound)) * sound.std() * 10 ** (-(20, 10)[seed % 2] / 20)
-        result = rosafe.process(0.1 * (sound + noise), RATE, parameters=rosafe.PRESETS["speech"], outputs="pitch")
+    for seed in range(4):
+        sound, pitch = glottal_vowel(np.random.default_rng([low, seed]), low, high, (20, 10)[seed % 2])
+        result = rosafe.process(sound, RATE, parameters=rosafe.PRESETS["speech"], outputs="pitch")
         expected = np.interp(result["pitch_time"], np.arange(len(pitch)) / RATE, pitch)
         rates.append(np.mean(np.abs(1200 * np.log2(result["pitch"][0, 0] / expected)[4:-4]) <= 50))
-    assert np.mean(rates) >= 0.98
+    assert np.mean(rates) >= 0.97
 
 
 def test_outputs_without_frames() -> None:
