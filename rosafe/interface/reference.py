@@ -54,10 +54,10 @@ pitch; at 5 dB it is better below 120 Hz and from 180 to 250 Hz, where the prese
 above. Pitches from 60 to 80 Hz are left out because 0.92 of the frames of 24 such vowels are right.
 
 In two recordings of speech and in synthetic voices (espeak-ng de+f2, en+m3), 0.99 or more of the frames that `pyin`
-takes as voiced are within 50 cents of it. Voices in which every other period is weaker are ambiguous: for espeak-ng
-es+f1 and en+f3, whose `roughness` weakens every other period, 0.50 and 0.76 of the frames are right and the others are
-an octave below `pyin`; without their `roughness`, 0.99 and 1.00. The defaults, which are those of the original, suit
-pitches above 150 Hz.
+takes as voiced are within 50 cents of it. For espeak-ng es+f1, en+f3 and fr+f4 with pitches of 260 to 280 Hz, 0.50,
+0.76 and 0.86 are, and most others are an octave below `pyin` (highest peak, `ac_K` = 2: 0.40, 0.58 and 0.75). The
+`roughness` of es+f1 and en+f3 weakens every other period, which makes the octave ambiguous; without it, 0.99 and 1.00
+are right. The defaults, which are those of the original, suit pitches above 150 Hz.
 
 `onsets`: onset and offset maps without marks in steady noise and in muted inputs. docs/onset-maps.md has its errors and
 those of the defaults.
