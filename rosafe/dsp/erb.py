@@ -12,6 +12,7 @@ import numpy as np
 
 EAR_Q = 9.265  # asymptotic filter quality at high frequencies
 MIN_BANDWIDTH = 24.7  # Hz, bandwidth at low frequencies
+BANDWIDTH_SLOPE = 0.108  # Hz per Hz
 
 
 def erb_rate(frequency: Any) -> Any:
@@ -26,4 +27,4 @@ def erb_rate_to_frequency(rate: Any) -> Any:
 
 def bandwidth(frequency: Any) -> Any:
     """Return the equivalent rectangular bandwidth (Hz) of the auditory filter at `frequency` (Hz): 24.7 + 0.108 f."""
-    return MIN_BANDWIDTH + 0.108 * np.asarray(frequency)
+    return MIN_BANDWIDTH + BANDWIDTH_SLOPE * np.asarray(frequency)

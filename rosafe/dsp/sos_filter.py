@@ -56,6 +56,44 @@ class SosFilter:
         return result
 
 
+def normal_form(section: NDArray[np.float64]) -> tuple[float, complex, complex]:
+    """Return b0, a pole p and a weight w: y[n] = b0 x[n] + 2 Re(w s[n-1]) with s[n] = p s[n-1] + x[n].
+
+    The section (b0, b1, b2, 1, a1, a2) has a pair of complex poles, or one real pole: then p and w are real, and y[n]
+    is b0 x[n] + w s[n-1].
+    """
+    b0, b1, b2, _, a1, a2 = section.astype(np.longdouble)
+    if not a2:
+        return float(b0), complex(-a1), complex(b1 - b0 * a1)
+    pole = -a1 / 2 + 1j * np.sqrt(a2 - a1 * a1 / 4)
+    weight = ((b1 - b0 * a1) * pole + b2 - b0 * a2) / (2j * pole.imag)
+    return float(b0), complex(pole), complex(weight)
+
+
+class NormalFormFilter:
+    """A cascade of second-order sections with complex poles, in normal form: one complex pole for each section.
+
+    The state of a pole only turns and shrinks. That of `SosFilter` loses digits if the poles are near 1, as those of a
+    high-pass at a few Hz are: four at 1 Hz and 48 kHz.
+    """
+
+    def __init__(self, sections: NDArray[np.float64]) -> None:
+        forms = [normal_form(section) for section in sections]
+        self._steps = [(b0, SosFilter(np.array([[0, weight, 0, 1, -pole, 0]]))) for b0, pole, weight in forms]
+        self.sections = sections
+
+    def reset(self) -> None:
+        """Reset the state to rest."""
+        for _, pole in self._steps:
+            pole.reset()
+
+    def process(self, block: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Filter (*rows, N) along its last axis."""
+        for b0, pole in self._steps:
+            block = b0 * block + 2 * pole.process(block).real
+        return block
+
+
 class SosFilterBank(SosFilter):
     """M real second-order sections in parallel, all of which filter the same samples."""
 

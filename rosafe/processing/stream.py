@@ -93,10 +93,7 @@ class Stream(OwnState):
 
     def _begin(self, outputs: Sequence[str], stages: Mapping[str, Stage]) -> None:
         """Begin a new sound with these outputs; create those stages that are not given."""
-        complete: dict[str, Stage] = {}
-        for kind in needed(outputs):
-            own = {p.name: self._values[p.name] for p in KINDS[kind].parameters if p.name in self._values}
-            complete[kind] = stages.get(kind) or STAGES[kind](_input_format(kind, complete, self._sound), **own)
+        complete = create_stages(self._sound, self._values, needed(outputs), stages)
         self._reader = BlockReader()
         self._length = 0  # samples
         self._next = dict.fromkeys(outputs, 0)  # where each output's next frame begins, in samples
@@ -276,6 +273,17 @@ class Stream(OwnState):
             `cc_lags` (s) and similar ones.
         """
         return _describe(self._rate, self._stages, list(self._next))
+
+
+def create_stages(
+    sound: SignalFormat, values: Mapping[str, Any], kinds: Sequence[str], given: Mapping[str, Stage] | None = None
+) -> dict[str, Stage]:
+    """Return the stages of `kinds`, parents first, with checked `values`; those that are `given` are used."""
+    stages: dict[str, Stage] = {}
+    for kind in kinds:
+        own = {p.name: values[p.name] for p in KINDS[kind].parameters if p.name in values}
+        stages[kind] = (given or {}).get(kind) or STAGES[kind](_input_format(kind, stages, sound), **own)
+    return stages
 
 
 def _input_format(kind: str, stages: Mapping[str, Stage], sound: SignalFormat) -> SignalFormat:

@@ -21,7 +21,7 @@ from rosafe.declarations.representation import Representation
 from rosafe.dsp.middle_ear import MODELS, middle_ear_fir
 from rosafe.dsp.numeric_limits import SQUARE_TINY, FloatArray, clamp
 from rosafe.dsp.rounding import round_half_away
-from rosafe.dsp.sos_filter import SosFilter, leaky_integrator
+from rosafe.dsp.sos_filter import NormalFormFilter, SosFilter, leaky_integrator
 from rosafe.dsp.stage import Stage
 
 DC_ORDER = 4
@@ -151,13 +151,13 @@ class PreProc(Stage):
             step.reset()
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        steps: list[SosFilter | PreEmphasis | GainControl | Fir] = []
+        steps: list[NormalFormFilter | PreEmphasis | GainControl | Fir] = []
         if values["pp_bRemoveDC"]:
             cutoff = values["pp_cutoffHzDC"]
             if cutoff >= self.sample_rate / 2:
                 raise ValueError(f"pp_cutoffHzDC: expected less than half the sample rate, got {cutoff:.12g} Hz")
             steps.append(
-                SosFilter(scipy.signal.butter(DC_ORDER, cutoff, "highpass", fs=self.sample_rate, output="sos"))
+                NormalFormFilter(scipy.signal.butter(DC_ORDER, cutoff, "highpass", fs=self.sample_rate, output="sos"))
             )
         if values["pp_bPreEmphasis"]:
             steps.append(PreEmphasis(abs(values["pp_coefPreEmphasis"])))

@@ -16,6 +16,7 @@ _PACKAGES = {
     "zarr": ("files", "python3-zarr"),
     "distributed": ("dask", "python3-distributed"),
     "dask": ("dask", "python3-distributed"),
+    "torch": ("torch", ""),
 }
 _OTHER_NAMES = {"alsaaudio": "pyalsaaudio", "yaml": "PyYAML"}  # of packages for pip
 _DEBIAN_DIR = Path("/usr/lib/python3/dist-packages")  # of the package python3-rosafe
@@ -41,7 +42,7 @@ def install(module: str) -> str:
     top = module.partition(".")[0]
     extra, debian = _PACKAGES.get(top, ("", ""))
     of_nodes = top.startswith(_ROS) or top in _WITH_ROS
-    if not by_pip():
+    if not by_pip() and top != "torch":  # of which Debian's package is too old
         if debian:
             return f"apt install {debian}, or pip install {top}"
         if _DEBIAN_DIR not in Path(__file__).parents:

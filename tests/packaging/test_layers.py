@@ -13,7 +13,7 @@ PACKAGE = ROOT / "rosafe"
 # The library, lowest first: each folder may import those before it.
 LIBRARY = (
     *("system", "declarations", "dsp", "plugin", "representations", "interface", "tree", "testing"),
-    *("audio.files", "results", "processing", "setups", "view", "localization", "audio.devices", "validation"),
+    *("audio.files", "results", "processing", "torch", "setups", "view", "localization", "audio.devices", "validation"),
 )
 # A door may import the library, and each of its folders those before it.
 DOORS = {
