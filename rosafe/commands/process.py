@@ -2,7 +2,7 @@
 
 Reads all formats of libsndfile (WAV, FLAC, Ogg, MP3, ...) and rosbags. A sound has two channels, left and right ear;
 --channels selects them. Writes one file of results beside each sound or to the path of -o; rosafe.load and rosafe plot
-read it. By default the framed outputs are kept: ild, ratemap and crossCorrelation.
+read .npz and .h5. By default the framed outputs are kept: ild, ratemap and crossCorrelation.
 The results equal those of the node for the same samples, bit for bit. Therefore samples are read as 32-bit integers
 (float files are scaled by 2^31-1 and rounded), and in_doNormalize is true by default."""
 
@@ -43,7 +43,7 @@ from rosafe.system.terminal import printable
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
 _MAX_JOBS = 10_000
-_EXTENSIONS = (".npz", ".h5", ".mat", ".zarr", ".csv")
+_EXTENSIONS = (".npz", ".h5", ".mat", ".csv")
 _NAMED = 20  # failures that are printed at the end if failed.csv lists all of them
 
 # --- the command line -------------------------------------------------------------------------------------------
@@ -132,7 +132,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def _epilog() -> str:
     parts = [named for kind in KINDS.values() for named in kind.outputs.items()]
     lines = [
-        "A file of results contains these outputs, as rosafe.process and rosafe.load return them:",
+        "A file of results contains these outputs, as rosafe.process returns them:",
         *(f"  {name} ({', '.join(part.axes)}) {part.unit}".rstrip() for name, part in parts),
         "the coordinates of their axes:",
         *textwrap.wrap(_coordinates(), 100, initial_indent="  ", subsequent_indent="  "),
@@ -323,7 +323,11 @@ def _output_path(inputs: list[Path], options: argparse.Namespace) -> tuple[Path 
     if out == "":
         options.usage_error("-o: expected a path, got an empty text")
     extension = os.path.splitext(out)[1].lower()
-    if out.endswith("/") or (os.path.isdir(out) and not (single and extension == ".zarr")):
+    if extension == ".zarr":
+        from rosafe.results.formats import ZARR
+
+        raise CommandError(f"-o: expected a name ending in {', '.join(_EXTENSIONS)}, got {out!r}; {ZARR}")
+    if out.endswith("/") or os.path.isdir(out):
         return Path(out), None
     if not single:
         if extension:

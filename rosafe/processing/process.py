@@ -30,10 +30,10 @@ from rosafe.processing.signals import (
     range_warning,
 )
 from rosafe.results.collector import OutputCollector, allocate_branches, join_branches
-from rosafe.results.memory import refuse_over_available
 from rosafe.results.result import Result
 from rosafe.system.version import VERSION
 from rosafe.tree.block import Block
+from rosafe.tree.sizes import refuse_over_available
 from rosafe.tree.workers import workers_to_use
 
 

@@ -16,7 +16,6 @@ import pytest
 import rosafe
 from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.processing import process as offline
-from rosafe.results import memory
 from rosafe.tree import sizes
 
 GOOD = np.zeros((2, 100))
@@ -292,13 +291,13 @@ def test_results_larger_than_the_free_memory(monkeypatch: pytest.MonkeyPatch, tm
     """If other processes use the memory, the kernel would end this process."""
     meminfo = tmp_path / "meminfo"
     meminfo.write_text("MemTotal:       24684196 kB\nMemFree: 1 kB\nMemAvailable:      12000 kB\n")
-    monkeypatch.setattr(memory, "_MEMINFO", meminfo)
+    monkeypatch.setattr(sizes, "_MEMINFO", meminfo)
     sound, large = np.zeros((2, 4000)), {"cc_maxDelaySec": 1.0}
     refused(r"outputs: expected at most 12 MiB \(free on this machine\), got", sound, RATE, parameters=large)
     with pytest.raises(ValueError, match=r"^block: expected at most 12 MiB \(free on this machine\), got .*; process"):
         rosafe.Stream(RATE, large).process(sound)
     meminfo.unlink()  # the free memory is unknown
-    assert memory.available() == sizes.machine_memory()
+    assert sizes.available_memory() == sizes.machine_memory()
 
 
 def test_large_files_are_refused_without_reading_them(tmp_path: Path) -> None:
