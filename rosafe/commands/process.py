@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import importlib
 import os
 import re
@@ -228,7 +227,8 @@ def _compute(plan: _Plan, corpus: _Corpus, options: argparse.Namespace, signals:
 
     if not options.dask:
         importlib.import_module("scipy.signal")  # imported once for all processes that are forked from this one
-    works = [partial(compute, *pair, plan.settings) for pair in zip(plan.sources, plan.targets, strict=True)]
+    pairs = zip(plan.sources, plan.targets, strict=True)
+    works = [partial(compute, *pair, plan.options, plan.make_folders) for pair in pairs]
     if works:
         run_tasks = _runner(options, len(works))
         run_tasks(works, options.jobs, (AudioFileError, OutputError, ValueError), corpus.report, signals)
@@ -240,13 +240,14 @@ class _Plan(NamedTuple):
     names: list[Path]  # of the inputs, as they are printed
     sources: list[Path]
     targets: list[Path]
-    settings: Any
+    options: dict[str, Any]  # of `process_file`
+    make_folders: bool
     problems: list[tuple[Path, str]]  # known before any file is processed
 
 
 def _plan(inputs: list[Path], folder: Path | None, file: Path | None, options: argparse.Namespace) -> _Plan:
     """Return the plan, checked as far as possible without reading the files. Raises ValueError."""
-    from rosafe.processing.corpus import Settings, find, output_paths
+    from rosafe.processing.corpus import find, output_paths
     from rosafe.processing.files import OUTPUTS
     from rosafe.results.formats import FORMATS, check_format, format_of
 
@@ -265,20 +266,19 @@ def _plan(inputs: list[Path], folder: Path | None, file: Path | None, options: a
         targets = output_paths(items, folder, file_format.extension)
     else:
         targets = output_paths([item._replace(place=item.source) for item in items], Path(), file_format.extension)
-    settings = Settings(
-        parameters,
-        outputs,
-        options.block,
-        options.channels,
-        options.topic,
-        options.force or (file is not None and not options.resume),
-        options.resume,
-        folder is not None,
-        options.pad,
-        not options.no_clip,
-    )
+    of_each = {
+        "parameters": parameters,
+        "outputs": outputs,
+        "block_frames": options.block,
+        "channels": options.channels,
+        "topic": options.topic,
+        "replace": options.force or (file is not None and not options.resume),
+        "resume": options.resume,
+        "pad": options.pad,
+        "clip": not options.no_clip,
+    }
     sources = [item.source for item in items]
-    return _Plan(sources, sources, targets, settings, problems)
+    return _Plan(sources, sources, targets, of_each, folder is not None, problems)
 
 
 def _for_dask(plan: _Plan, options: argparse.Namespace) -> _Plan:
@@ -289,14 +289,14 @@ def _for_dask(plan: _Plan, options: argparse.Namespace) -> _Plan:
     """
     names, sources, targets, problems = [], [], [], list(plan.problems)
     for name, target in zip(plan.names, plan.targets, strict=True):
-        if not (plan.settings.replace or options.resume) and os.path.lexists(target):
+        if not (plan.options["replace"] or options.resume) and os.path.lexists(target):
             problems.append((name, f"{name}: {target} already exists; --resume keeps it, --force replaces it"))
             continue
         names.append(name)
         sources.append(Path(os.path.abspath(name)))
         targets.append(Path(os.path.abspath(target)))
-    settings = dataclasses.replace(plan.settings, resume=not plan.settings.replace)
-    return _Plan(names, sources, targets, settings, problems)
+    of_each = {**plan.options, "resume": not plan.options["replace"]}
+    return _Plan(names, sources, targets, of_each, plan.make_folders, problems)
 
 
 def _runner(options: argparse.Namespace, count: int) -> Any:

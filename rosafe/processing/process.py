@@ -40,7 +40,7 @@ from rosafe.tree.workers import workers_to_use
 def process(
     signal: Any,
     sample_rate: float,
-    *positional: Any,
+    *,
     parameters: Mapping[str, Any] | None = None,
     block_frames: int | Sequence[int] = DEFAULT_FRAMES_PER_BLOCK,
     modifications: Sequence[tuple[int, str, Any]] = (),
@@ -123,11 +123,8 @@ def process(
     """
     if unknown:
         raise unknown_argument(next(iter(unknown)))
-    options = (parameters, block_frames, modifications, outputs)
-    if positional:
-        options = _merge_positional(positional, options)
     try:
-        call = ProcessCall(signal, sample_rate, *options, pad=pad, dtype=dtype)
+        call = ProcessCall(signal, sample_rate, parameters, block_frames, modifications, outputs, pad, dtype)
     except ValueError as problem:
         raise problem.with_traceback(None) from None  # internal frames do not help the caller
     result = call.run()
@@ -137,17 +134,9 @@ def process(
 
 
 process.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-    [p for p in inspect.signature(process).parameters.values() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)],
+    [p for p in inspect.signature(process).parameters.values() if p.kind is not p.VAR_KEYWORD],
     return_annotation="Result",
 )
-
-
-def _merge_positional(positional: tuple[Any, ...], options: tuple[Any, Any, Any, Any]) -> tuple[Any, Any, Any, Any]:
-    """Return the options with those that were given by position, which is deprecated."""
-    if len(positional) > len(options):
-        raise TypeError(f"process: expected 2 positional arguments, got {2 + len(positional)}")
-    warnings.warn("pass arguments after sample_rate by name, as in parameters={...}", DeprecationWarning, 3)
-    return (*positional, *options[len(positional) :])
 
 
 class ProcessCall:

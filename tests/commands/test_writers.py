@@ -16,7 +16,7 @@ from tests.commands import forked
 from tests.commands.command import SMALL, SMALL_PARAMETERS, as_int32, ild_in, noise, refused, write
 from tests.commands.command import rosafe as command
 from tests.commands.forked import process
-from tests.harness import PYTHON, ROOT, SCRIPTS
+from tests.harness import PYTHON, ROOT
 
 EXTENSIONS = [".npz", ".h5", ".mat", ".csv"]
 
@@ -82,22 +82,6 @@ def test_many_concurrent_writers(tmp_path: Path, extension: str) -> None:
         own = [np.array_equal(ild_in(target), one) for one in expected]
         assert own.count(True) == 1 and results[own.index(True)] == "done"
         assert not [name for name in os.listdir(out) if name.endswith(".part")]
-
-
-@pytest.mark.exploration  # test_corpus.py has two runs for one folder of files
-def test_two_runs_for_one_folder(tmp_path: Path) -> None:
-    paths, expected = sounds(tmp_path, 2)
-    arguments = ["process", *map(str, paths), "-o", "out/x/", "--format", "h5", *SMALL, "--outputs=ild", "--jobs=2"]
-    running = [
-        subprocess.Popen([str(SCRIPTS / "rosafe"), *arguments], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
-        for _ in range(2)
-    ]
-    said = [process.communicate(timeout=120)[1] for process in running]
-    assert all(process.returncode in (0, 1) for process in running), said
-    assert not any("Traceback" in text for text in said), said
-    for path, one in zip(paths, expected, strict=True):
-        np.testing.assert_array_equal(ild_in(tmp_path / "out" / "x" / f"{path.stem}.h5"), one)
-    assert not list(tmp_path.rglob("*.part"))
 
 
 def test_one_output_named_by_two_inputs(tmp_path: Path) -> None:

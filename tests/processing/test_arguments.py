@@ -272,13 +272,11 @@ def test_tracebacks_end_at_the_call() -> None:
         assert raised.value.__suppress_context__
 
 
-def test_positional_options_are_deprecated() -> None:
+def test_options_are_given_by_name() -> None:
     kinds = [p.kind.name for p in inspect.signature(rosafe.process).parameters.values()]
     assert kinds == ["POSITIONAL_OR_KEYWORD"] * 2 + ["KEYWORD_ONLY"] * 6
-    with pytest.warns(DeprecationWarning, match="by name"), pytest.raises(ValueError, match="fb_nERBs"):
-        rosafe.process(GOOD, RATE, {"fb_nERBs": 0})
-    with pytest.raises(TypeError, match="expected 2 positional arguments, got 7"):
-        rosafe.process(GOOD, RATE, {}, 1, (), None, 5)
+    with pytest.raises(TypeError, match="takes 2 positional arguments but 3 were given"):
+        rosafe.process(GOOD, RATE, {"fb_nERBs": 0})  # type: ignore[call-arg]
 
 
 def test_sizes_beyond_the_memory() -> None:
