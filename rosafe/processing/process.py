@@ -20,6 +20,7 @@ from rosafe.interface.arguments import check_change, check_parameters
 from rosafe.interface.remarks import no_frames, rate_advice, unknown_argument, warnings_of
 from rosafe.processing import chain
 from rosafe.processing.chain import Chain, FrameLimiter, computed_ears, effective_parameters
+from rosafe.processing.collector import OutputCollector, allocate_branches, join_branches
 from rosafe.processing.signals import (
     as_samples,
     check_finite,
@@ -29,7 +30,6 @@ from rosafe.processing.signals import (
     outputs_of,
     range_warning,
 )
-from rosafe.results.collector import OutputCollector, allocate_branches, join_branches
 from rosafe.results.result import Result
 from rosafe.system.version import VERSION
 from rosafe.tree.block import Block

@@ -13,8 +13,7 @@ import pytest
 
 import rosafe
 from tests.commands import forked
-from tests.commands.command import SMALL, SMALL_PARAMETERS, as_int32, ild_in, noise, refused, write
-from tests.commands.command import rosafe as command
+from tests.commands.command import SMALL_PARAMETERS, as_int32, ild_in, noise, write
 from tests.commands.forked import process
 from tests.harness import PYTHON, ROOT
 
@@ -82,15 +81,6 @@ def test_many_concurrent_writers(tmp_path: Path, extension: str) -> None:
         own = [np.array_equal(ild_in(target), one) for one in expected]
         assert own.count(True) == 1 and results[own.index(True)] == "done"
         assert not [name for name in os.listdir(out) if name.endswith(".part")]
-
-
-def test_one_output_named_by_two_inputs(tmp_path: Path) -> None:
-    sounds(tmp_path, 1)
-    (tmp_path / "link.wav").symlink_to("0.wav")
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "link.h5").symlink_to("0.h5")
-    done = command("process", "0.wav", "link.wav", "-o", "out", "--format", "h5", *SMALL, cwd=tmp_path)
-    refused(done, "0.wav and link.wav would both be written to out/")
 
 
 # --- full disks ---------------------------------------------------------------------------------------------------

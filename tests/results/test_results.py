@@ -98,17 +98,13 @@ def test_union_has_the_outputs_of_both(result: rosafe.Result) -> None:
 def test_attributes_are_read_as_entries(tmp_path: Path, result: rosafe.Result) -> None:
     result.save(tmp_path / "a.npz")
     for one in (result, rosafe.load(tmp_path / "a.npz")):
+        assert type(one.sample_rate) is float
         assert one["parameters"] == one.parameters and one["sample_rate"] == one.get("sample_rate") == RATE
         assert one["rosafe_version"] == one.version and one["clipped"] == 0
         assert one["axes"] == one.axes and one["units"] == one.units and "units" in one
         assert "nothing" not in one and one.get("nothing", 3) == 3 and "axes" not in [*one]
         with pytest.raises(KeyError, match="nothing"):
             one["nothing"]
-
-
-def test_loaded_attributes_have_the_declared_types(tmp_path: Path, result: rosafe.Result) -> None:
-    result.save(tmp_path / "result.npz")
-    assert type(result.sample_rate) is type(rosafe.load(tmp_path / "result.npz").sample_rate) is float
 
 
 def test_plot_and_xarray(tmp_path: Path, result: rosafe.Result) -> None:
@@ -296,15 +292,6 @@ def test_floats_without_clipping(tmp_path: Path, extension: str) -> None:
     assert process_file(tmp_path / "a.wav", target, FEW, 500, clip=False, resume=True).skipped
     with pytest.raises(OutputError, match=r"other (clip|parameters)"):
         process_file(tmp_path / "a.wav", target, FEW, 500, resume=True)
-
-
-def test_mono_files_with_outputs_of_one_ear(tmp_path: Path) -> None:
-    soundfile.write(tmp_path / "a.wav", SOUND[0], RATE, subtype="PCM_16")
-    process_file(tmp_path / "a.wav", tmp_path / "a.npz", FEW, outputs=["ratemap", "input"])
-    samples = soundfile.read(tmp_path / "a.wav", dtype="int16")[0]
-    assert_same(
-        rosafe.load(tmp_path / "a.npz"), rosafe.process(samples, RATE, parameters=FEW, outputs=["ratemap", "input"])
-    )
 
 
 # --- warnings and advice ---
