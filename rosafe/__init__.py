@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from rosafe.processing.process import process
     from rosafe.processing.resynthesis import Resynthesizer, resynthesize
     from rosafe.processing.stream import Stream
-    from rosafe.results.formats import load
+    from rosafe.results.readers import load
     from rosafe.results.result import Result
     from rosafe.view.dataset import to_xarray
     from rosafe.view.plot import plot
@@ -61,7 +61,7 @@ _MODULES = {
     "deltas": "rosafe.processing.features",
     "direction_mask": "rosafe.localization.enhancement",
     "enhance": "rosafe.localization.enhancement",
-    "load": "rosafe.results.formats",
+    "load": "rosafe.results.readers",
     "localize": "rosafe.localization.localize",
     "plot": "rosafe.view.plot",
     "process": "rosafe.processing.process",

@@ -54,7 +54,7 @@ COMMANDS: Mapping[str, Sequence[str]] = {  # what commands of `rosafe` import wh
     "enhance": _OFFLINE,
     "localize": (*_OFFLINE, "rosafe.ros1.localizer.node", *NODES),
     "plot": (*_OFFLINE, "matplotlib.figure", "matplotlib.backends.backend_agg"),
-    "process": (*_OFFLINE, "h5py", "zarr"),
+    "process": (*_OFFLINE, "h5py"),
     "record": (*_SOUNDS, "rosafe.ros1.bass.recording.recorder", "rosafe.audio.devices.scene"),
     "trace": _OFFLINE,
 }

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rosafe.interface.arguments import check_parameter
 from rosafe.interface.remarks import PRESETS
+
+if TYPE_CHECKING:
+    from rosafe.results.result import Result
 
 
 class _Settings(argparse.Action):
@@ -110,6 +114,24 @@ def parameters_of(settings: list[str], preset: str | None = None) -> dict[str, A
             raise ValueError(f"{name}: expected one value, got two")
         values[name] = value
     return {**PRESETS[preset], **values} if preset else values
+
+
+def load_result(path: str | Path) -> Result:
+    """Return the result in a file as `rosafe.load`; ValueError also if the file cannot be opened."""
+    from rosafe.results.readers import load
+
+    try:
+        return load(path)
+    except OSError as problem:
+        raise ValueError(f"{path}: {problem.strerror}") from None
+
+
+def one_input(options: argparse.Namespace, what: str) -> str:
+    """Return the only input of a command, or exit with a usage error."""
+    inputs = [*options.inputs, *options.more_inputs]
+    if len(inputs) != 1:
+        options.usage_error(f"{what}, got {len(inputs)}")
+    return str(inputs[0])
 
 
 def parse_settings(text: str | None) -> list[str] | None:

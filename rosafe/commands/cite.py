@@ -6,11 +6,10 @@ about these representations and their parents. With neither it is about the soft
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_settings, parameters_of, parse_settings
+from rosafe.commands._parameters import add_settings, load_result, parameters_of, parse_settings
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
     from rosafe.interface.arguments import needed
 
     try:
-        names, known = _of_result(Path(results[0])) if results else _of_options(options)
+        names, known = _of_result(results[0]) if results else _of_options(options)
     except ValueError as problem:
         raise CommandError(str(problem)) from None
     kinds = [KINDS[name] for name in needed(names)] if names else []
@@ -50,13 +49,8 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _of_result(path: Path) -> tuple[list[str], dict[str, Any]]:
-    from rosafe.results.formats import load
-
-    try:
-        result = load(path)
-    except OSError as problem:
-        raise ValueError(f"{path}: {problem.strerror}") from None
+def _of_result(path: str) -> tuple[list[str], dict[str, Any]]:
+    result = load_result(path)
     return result.kinds, {
         "parameters": result.parameters,
         "sample_rate": result.sample_rate,

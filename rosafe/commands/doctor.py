@@ -54,7 +54,7 @@ _PLOTS = {"matplotlib": "python3-matplotlib"}
 _HTTP = {"aiohttp": "python3-aiohttp"}
 _TCL = {"tkinter": "python3-tk"}
 _TCL_COMMANDS = {"tclsh": "tcl"}
-_EXTRAS = ("h5py", "zarr", "xarray", "distributed")  # needed only by the formats and commands of the same names
+_EXTRAS = ("h5py", "xarray", "distributed")  # needed only by the formats and commands of the same names
 # Not installed by pip, and not needed by users of the library.
 _OF_NODES = ("ROS", "messages", "master", "address", "alsaaudio", "sound devices", "HTTP server", "Tcl")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_mirror, add_settings, ear_channels, head_of, parameters_of
+from rosafe.commands._parameters import add_mirror, add_settings, ear_channels, head_of, one_input, parameters_of
 from rosafe.system import option_types
 from rosafe.system.output import check_target, write_files
 
@@ -57,9 +57,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Enhance and write the sound."""
-    inputs = [*options.inputs, *options.more_inputs]
-    if len(inputs) != 1:
-        options.usage_error(f"SOUND: expected one file, got {len(inputs)}")
+    source = one_input(options, "SOUND: expected one file")
     target = Path(options.to)
     if target.suffix.lower() != ".wav":
         options.usage_error(f"-o: expected a name that ends in .wav, got {target}")
@@ -69,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
     from rosafe.processing.sounds import read_ears
 
     try:
-        sound, rate = read_ears(inputs[0], options.channels)
+        sound, rate = read_ears(source, options.channels)
         enhanced = enhance(
             sound,
             rate,

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_mirror, add_settings, parameters_of
+from rosafe.commands._parameters import add_mirror, add_settings, one_input, parameters_of
 from rosafe.system import option_types
 from rosafe.system.output import check_target
 
@@ -51,9 +51,7 @@ def _action(text: str) -> str:
 
 def run(options: argparse.Namespace) -> int:
     """Learn and write the model."""
-    inputs = [*options.inputs, *options.more_inputs]
-    if len(inputs) != 1:
-        options.usage_error(f"SOURCE: expected one SOFA file or one list of recordings, got {len(inputs)}")
+    source = one_input(options, "SOURCE: expected one SOFA file or one list of recordings")
     target = Path(options.to)
     check_target(target, options.force)
     from rosafe.audio.files.audiofile import AudioFileError
@@ -63,15 +61,15 @@ def run(options: argparse.Namespace) -> int:
     from rosafe.localization.training import learn_head
 
     parameters = parameters_of(options.settings) or None
-    progress = terminal_progress(inputs[0])
+    progress = terminal_progress(source)
     try:
-        if inputs[0].lower().endswith(".csv"):
+        if source.lower().endswith(".csv"):
             if options.mirror is not None:
-                raise ValueError(f"--mirror: expected a SOFA file, got {inputs[0]}")
-            model = learn_recordings(inputs[0], options.rate, parameters, progress)
+                raise ValueError(f"--mirror: expected a SOFA file, got {source}")
+            model = learn_recordings(source, options.rate, parameters, progress)
         else:
             model = learn_head(
-                Head.from_sofa(inputs[0], options.mirror), float(options.rate or _RATE), parameters, progress
+                Head.from_sofa(source, options.mirror), float(options.rate or _RATE), parameters, progress
             )
         if progress:
             progress(1.0)

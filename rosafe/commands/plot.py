@@ -21,6 +21,8 @@ from rosafe.commands._parameters import (
     add_preset,
     add_settings,
     clipping_warning,
+    load_result,
+    one_input,
     parameters_of,
     parse_settings,
 )
@@ -78,10 +80,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Draw the picture."""
-    inputs = [*options.inputs, *options.more_inputs]
-    if len(inputs) != 1:
-        options.usage_error(f"expected exactly one sound file or result, got {len(inputs)}")
-    source = Path(inputs[0])
+    source = Path(one_input(options, "expected exactly one sound file or result"))
     target = Path(source.with_suffix(".png") if options.to is None else options.to)
     if target.suffix.lower() != ".png":
         raise CommandError(f"-o: expected a name ending in .png, got {target}")
@@ -96,10 +95,14 @@ def run(options: argparse.Namespace) -> int:
     names = parse_settings(options.outputs)
     result: Mapping[str, Any]
     try:
-        if source.suffix.lower() in FORMATS:
+        if source.suffix.lower() in (*FORMATS, ".zarr"):
             if options.preset:
                 options.usage_error("--preset: a result already has its parameters")
-            result = _result(source, options.settings)
+            if options.settings:
+                raise ValueError(
+                    "--set: expected a sound, got a result, which already has its parameters; name the sound instead"
+                )
+            result = load_result(source)
         else:
             sound, rate = _sound(source, not options.no_clip)
             names = check_outputs(names) if names else _default(len(sound))
@@ -115,19 +118,6 @@ def run(options: argparse.Namespace) -> int:
         raise CommandError(str(problem)) from None
     save(figure, target, options.to is not None or options.force)
     return 0
-
-
-def _result(path: Path, settings: list[str]) -> Mapping[str, Any]:
-    from rosafe.results.formats import load
-
-    if settings:
-        raise ValueError(
-            "--set: expected a sound, got a result, which already has its parameters; name the sound instead"
-        )
-    try:
-        return load(path)
-    except OSError as problem:
-        raise ValueError(f"{path}: {problem.strerror}") from None
 
 
 def _sound(path: Path, clip: bool) -> tuple[np.ndarray, int]:

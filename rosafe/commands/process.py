@@ -2,7 +2,7 @@
 
 Reads all formats of libsndfile (WAV, FLAC, Ogg, MP3, ...) and rosbags. A sound has two channels, left and right ear;
 --channels selects them. Writes one file of results beside each sound or to the path of -o; rosafe.load and rosafe plot
-read it. By default the framed outputs are kept: ild, ratemap and crossCorrelation.
+read .npz and .h5. By default the framed outputs are kept: ild, ratemap and crossCorrelation.
 The results equal those of the node for the same samples, bit for bit. Therefore samples are read as 32-bit integers
 (float files are scaled by 2^31-1 and rounded), and in_doNormalize is true by default."""
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import importlib
 import os
 import re
@@ -43,7 +42,7 @@ from rosafe.system.terminal import printable
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
 _MAX_JOBS = 10_000
-_EXTENSIONS = (".npz", ".h5", ".mat", ".zarr", ".csv")
+_EXTENSIONS = (".npz", ".h5", ".mat", ".csv")
 _NAMED = 20  # failures that are printed at the end if failed.csv lists all of them
 
 # --- the command line -------------------------------------------------------------------------------------------
@@ -132,7 +131,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def _epilog() -> str:
     parts = [named for kind in KINDS.values() for named in kind.outputs.items()]
     lines = [
-        "A file of results contains these outputs, as rosafe.process and rosafe.load return them:",
+        "A file of results contains these outputs, as rosafe.process returns them:",
         *(f"  {name} ({', '.join(part.axes)}) {part.unit}".rstrip() for name, part in parts),
         "the coordinates of their axes:",
         *textwrap.wrap(_coordinates(), 100, initial_indent="  ", subsequent_indent="  "),
@@ -228,7 +227,8 @@ def _compute(plan: _Plan, corpus: _Corpus, options: argparse.Namespace, signals:
 
     if not options.dask:
         importlib.import_module("scipy.signal")  # imported once for all processes that are forked from this one
-    works = [partial(compute, *pair, plan.settings) for pair in zip(plan.sources, plan.targets, strict=True)]
+    pairs = zip(plan.sources, plan.targets, strict=True)
+    works = [partial(compute, *pair, plan.options, plan.make_folders) for pair in pairs]
     if works:
         run_tasks = _runner(options, len(works))
         run_tasks(works, options.jobs, (AudioFileError, OutputError, ValueError), corpus.report, signals)
@@ -240,13 +240,14 @@ class _Plan(NamedTuple):
     names: list[Path]  # of the inputs, as they are printed
     sources: list[Path]
     targets: list[Path]
-    settings: Any
+    options: dict[str, Any]  # of `process_file`
+    make_folders: bool
     problems: list[tuple[Path, str]]  # known before any file is processed
 
 
 def _plan(inputs: list[Path], folder: Path | None, file: Path | None, options: argparse.Namespace) -> _Plan:
     """Return the plan, checked as far as possible without reading the files. Raises ValueError."""
-    from rosafe.processing.corpus import Settings, find, output_paths
+    from rosafe.processing.corpus import find, output_paths
     from rosafe.processing.files import OUTPUTS
     from rosafe.results.formats import FORMATS, check_format, format_of
 
@@ -265,20 +266,19 @@ def _plan(inputs: list[Path], folder: Path | None, file: Path | None, options: a
         targets = output_paths(items, folder, file_format.extension)
     else:
         targets = output_paths([item._replace(place=item.source) for item in items], Path(), file_format.extension)
-    settings = Settings(
-        parameters,
-        outputs,
-        options.block,
-        options.channels,
-        options.topic,
-        options.force or (file is not None and not options.resume),
-        options.resume,
-        folder is not None,
-        options.pad,
-        not options.no_clip,
-    )
+    of_each = {
+        "parameters": parameters,
+        "outputs": outputs,
+        "block_frames": options.block,
+        "channels": options.channels,
+        "topic": options.topic,
+        "replace": options.force or (file is not None and not options.resume),
+        "resume": options.resume,
+        "pad": options.pad,
+        "clip": not options.no_clip,
+    }
     sources = [item.source for item in items]
-    return _Plan(sources, sources, targets, settings, problems)
+    return _Plan(sources, sources, targets, of_each, folder is not None, problems)
 
 
 def _for_dask(plan: _Plan, options: argparse.Namespace) -> _Plan:
@@ -289,14 +289,14 @@ def _for_dask(plan: _Plan, options: argparse.Namespace) -> _Plan:
     """
     names, sources, targets, problems = [], [], [], list(plan.problems)
     for name, target in zip(plan.names, plan.targets, strict=True):
-        if not (plan.settings.replace or options.resume) and os.path.lexists(target):
+        if not (plan.options["replace"] or options.resume) and os.path.lexists(target):
             problems.append((name, f"{name}: {target} already exists; --resume keeps it, --force replaces it"))
             continue
         names.append(name)
         sources.append(Path(os.path.abspath(name)))
         targets.append(Path(os.path.abspath(target)))
-    settings = dataclasses.replace(plan.settings, resume=not plan.settings.replace)
-    return _Plan(names, sources, targets, settings, problems)
+    of_each = {**plan.options, "resume": not plan.options["replace"]}
+    return _Plan(names, sources, targets, of_each, plan.make_folders, problems)
 
 
 def _runner(options: argparse.Namespace, count: int) -> Any:
@@ -323,7 +323,11 @@ def _output_path(inputs: list[Path], options: argparse.Namespace) -> tuple[Path 
     if out == "":
         options.usage_error("-o: expected a path, got an empty text")
     extension = os.path.splitext(out)[1].lower()
-    if out.endswith("/") or (os.path.isdir(out) and not (single and extension == ".zarr")):
+    if extension == ".zarr":
+        from rosafe.results.formats import ZARR
+
+        raise CommandError(f"-o: expected a name ending in {', '.join(_EXTENSIONS)}, got {out!r}; {ZARR}")
+    if out.endswith("/") or os.path.isdir(out):
         return Path(out), None
     if not single:
         if extension:

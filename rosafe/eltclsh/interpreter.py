@@ -2,21 +2,49 @@
 
 from __future__ import annotations
 
+import _tkinter
 import contextlib
+import ctypes
 import inspect
 import os
 import sys
 import tkinter
 from collections.abc import Callable
+from ctypes import c_char_p, c_int, c_void_p
 from pathlib import Path
 from typing import Any
-
-from rosafe.eltclsh.library import tcl as library
 
 LIBRARY = Path(__file__).resolve().parent
 _CODE = LIBRARY.parents[1]
 # The folder of the Tcl package genomix, in a checkout or relative to lib/python3/dist-packages of an installation.
 PACKAGES = [str(path) for path in (_CODE / "tcl", _CODE.parents[1] / "tcltk") if (path / "genomix").is_dir()]
+
+# C functions of the Tcl library of tkinter that tkinter does not provide: exit, and signals while Tcl is busy. Their
+# callbacks must not use the interpreter of tkinter: it stores the Python thread state in a variable that such a call
+# would clear. They evaluate scripts with `Tcl_EvalEx`. Commands of `createcommand` may use both.
+EVAL_GLOBAL = 0x20000
+CANCEL_UNWIND = 0x100000
+OK = 0
+
+AsyncProc = ctypes.CFUNCTYPE(c_int, c_void_p, c_void_p, c_int)
+
+_FUNCTIONS = {  # result and arguments
+    "Tcl_AsyncCreate": (c_void_p, [AsyncProc, c_void_p]),
+    "Tcl_AsyncMark": (None, [c_void_p]),
+    "Tcl_BackgroundException": (None, [c_void_p, c_int]),
+    "Tcl_CancelEval": (c_int, [c_void_p, c_void_p, c_void_p, c_int]),
+    "Tcl_EvalEx": (c_int, [c_void_p, c_char_p, c_int, c_int]),
+    "Tcl_Exit": (None, [c_int]),
+    "Tcl_FindExecutable": (None, [c_char_p]),
+    "Tcl_NewStringObj": (c_void_p, [c_char_p, c_int]),
+    "Tcl_RestoreInterpState": (c_int, [c_void_p, c_void_p]),
+    "Tcl_SaveInterpState": (c_void_p, [c_void_p, c_int]),
+}
+
+library = ctypes.CDLL(_tkinter.__file__)  # also finds the symbols of libtcl
+for _name, (_result, _arguments) in _FUNCTIONS.items():
+    _function = getattr(library, _name)
+    _function.restype, _function.argtypes = _result, _arguments
 
 
 class Interpreter:

@@ -13,8 +13,7 @@ from rosafe.eltclsh.signals import Signals
 from rosafe.system.version import VERSION
 
 if TYPE_CHECKING:  # scripts do not need readline
-    from rosafe.eltclsh.history import LineHistory
-    from rosafe.eltclsh.line import LineReader
+    from rosafe.eltclsh.line import LineHistory, LineReader
 
 
 class Prompt:
@@ -173,8 +172,7 @@ class Prompt:
         """Return reader and history; readline is loaded by the first call."""
         if self._reader is None or self._history is None:
             from rosafe.eltclsh.complete import Completer
-            from rosafe.eltclsh.history import LineHistory
-            from rosafe.eltclsh.line import LineReader
+            from rosafe.eltclsh.line import LineHistory, LineReader
 
             completer = Completer(self._tcl)
             self._reader = LineReader(self._tcl, lambda before, word: completer.complete(self._pending + before, word))

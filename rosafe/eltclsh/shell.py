@@ -9,11 +9,10 @@ import sys
 from tkinter import TclError
 from typing import NoReturn
 
-from rosafe.eltclsh.interpreter import LIBRARY, PACKAGES, Interpreter
-from rosafe.eltclsh.library import tcl as library
+from rosafe.eltclsh.complete import parse
+from rosafe.eltclsh.interpreter import LIBRARY, PACKAGES, Interpreter, library
 from rosafe.eltclsh.prompt import Prompt
 from rosafe.eltclsh.signals import Signals
-from rosafe.eltclsh.words import parse
 from rosafe.system.version import VERSION
 
 COMPATIBLE_VERSION = "1.20"  # of the original, for `package require eltclsh`

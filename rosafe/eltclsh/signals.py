@@ -9,8 +9,7 @@ import threading
 from collections import deque
 from tkinter import TclError
 
-from rosafe.eltclsh import library
-from rosafe.eltclsh.interpreter import Interpreter
+from rosafe.eltclsh.interpreter import CANCEL_UNWIND, EVAL_GLOBAL, OK, AsyncProc, Interpreter, library
 
 _NAMES = {number.name.removeprefix("SIG"): number for number in signal.Signals}
 
@@ -68,8 +67,8 @@ class Signals:
     def _listen(self) -> None:
         if self._forwarder is not None:
             return
-        self._procedure = library.AsyncProc(self._run_scripts)  # Tcl holds no reference to it
-        handler = library.tcl.Tcl_AsyncCreate(self._procedure, None)
+        self._procedure = AsyncProc(self._run_scripts)  # Tcl holds no reference to it
+        handler = library.Tcl_AsyncCreate(self._procedure, None)
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
@@ -82,24 +81,24 @@ class Signals:
     def _forward(self, reader: int, handler: int) -> None:
         while numbers := os.read(reader, 64):
             self._arrived.extend(numbers)
-            library.tcl.Tcl_AsyncMark(handler)
+            library.Tcl_AsyncMark(handler)
 
     def _run_scripts(self, _data: int, _interp: int, code: int) -> int:
         """Run the scripts of received signals. Called by Tcl between two instructions, or while it waits for events."""
         address = self._interpreter.address
-        state = library.tcl.Tcl_SaveInterpState(address, code)
+        state = library.Tcl_SaveInterpState(address, code)
         while self._arrived:
             script = self._actions.get(self._arrived.popleft(), "-default")
             if script in ("-default", "-ignore"):
                 continue
-            result = library.tcl.Tcl_EvalEx(address, script.encode(), -1, library.EVAL_GLOBAL)
-            if result != library.OK:
-                library.tcl.Tcl_BackgroundException(address, result)
-        code = int(library.tcl.Tcl_RestoreInterpState(address, state))
+            result = library.Tcl_EvalEx(address, script.encode(), -1, EVAL_GLOBAL)
+            if result != OK:
+                library.Tcl_BackgroundException(address, result)
+        code = int(library.Tcl_RestoreInterpState(address, state))
         if self._cancel:
             self._cancel = False
-            message = library.tcl.Tcl_NewStringObj(b"interrupted", -1)
-            library.tcl.Tcl_CancelEval(address, message, None, library.CANCEL_UNWIND)
+            message = library.Tcl_NewStringObj(b"interrupted", -1)
+            library.Tcl_CancelEval(address, message, None, CANCEL_UNWIND)
         return code
 
 

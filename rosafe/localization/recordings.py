@@ -18,8 +18,8 @@ from rosafe.localization.horizontal_plane import MAX_GAP
 from rosafe.localization.results import read_recordings
 from rosafe.localization.training import Progress
 from rosafe.processing.sounds import open_sound
-from rosafe.results.memory import refuse_over_available
 from rosafe.system.terminal import printable
+from rosafe.tree.sizes import refuse_over_available
 
 MAX_SECONDS = 60.0  # of sound that is used for a direction
 MAX_FRAMES = 2**22  # of a direction

@@ -22,7 +22,7 @@ from rosafe.localization.horizontal_plane import (
     choose_directions,
     near_ear_gain,
 )
-from rosafe.results.containers import open_hdf5
+from rosafe.results.hdf5_reading import open_hdf5
 from rosafe.system.terminal import printable
 
 CONVENTION = "SimpleFreeFieldHRIR"

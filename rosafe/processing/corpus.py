@@ -7,7 +7,6 @@ import csv
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from io import StringIO, TextIOWrapper
 from itertools import takewhile
 from pathlib import Path, PurePath
@@ -29,45 +28,18 @@ class FileJob(NamedTuple):
     place: PurePath
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Options of `process_file` that apply to all sounds."""
-
-    parameters: Mapping[str, Any]
-    outputs: Sequence[str]
-    block_frames: int
-    channels: tuple[int, int] | None = None
-    topic: str | None = None
-    replace: bool = False
-    resume: bool = False
-    make_folders: bool = False
-    pad: bool = False
-    clip: bool = True
-
-
-def compute(source: Path, target: Path, settings: Settings, progress: Callable[[int, int], None]) -> Any:
-    """Call `process_file` with `settings`."""
+def compute(
+    source: Path, target: Path, options: Mapping[str, Any], make_folders: bool, progress: Callable[[int, int], None]
+) -> Any:
+    """Call `process_file` with `options`, for a target whose folder may be missing with `make_folders`."""
     from rosafe.processing.files import process_file
 
     try:
-        if settings.make_folders:
+        if make_folders:
             make_folder(target.parent)
     except OSError as problem:
         raise OutputError(f"cannot write {target}: {problem.strerror}") from None
-    return process_file(
-        source,
-        target,
-        settings.parameters,
-        settings.block_frames,
-        settings.outputs,
-        settings.replace,
-        progress,
-        channels=settings.channels,
-        topic=settings.topic,
-        resume=settings.resume,
-        pad=settings.pad,
-        clip=settings.clip,
-    )
+    return process_file(source, target, progress=progress, **options)
 
 
 # --- input files ------------------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import threading
 import time
@@ -20,9 +22,11 @@ from rosafe.interface.arguments import check_outputs, check_parameters
 from rosafe.processing.chain import Chain, FrameLimiter, computed_ears, effective_parameters
 from rosafe.processing.signals import of_ears
 from rosafe.processing.sounds import SoundReader, open_sound
-from rosafe.results.formats import Format, check_format, format_of, new_output, read
-from rosafe.results.result_metadata import Contents, ResultWriter
-from rosafe.system.output import OutputError
+from rosafe.results.formats import Format, check_format, format_of, options_in
+from rosafe.results.readers import READERS, read
+from rosafe.results.result_metadata import Contents
+from rosafe.results.writers import ResultWriter
+from rosafe.system.output import OutputError, new_path
 from rosafe.system.version import VERSION
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
@@ -62,7 +66,7 @@ def process_file(
     """Compute the auditory representations of a sound file, block by block, and write them to a file.
 
     The numbers are those of `rosafe.process` on the file's int32 samples, and of the node on the same samples, bit
-    for bit. `rosafe.load` reads the result. `target` does not exist before it is complete.
+    for bit. `rosafe.load` reads .npz and .h5. `target` does not exist before it is complete.
 
     Parameters
     ----------
@@ -70,8 +74,8 @@ def process_file(
         Sound file of two channels, left and right ear, or a rosbag (.bag). A mono file is accepted if `outputs` are
         given and none of them compares two ears.
     target : path
-        The result file. The end of its name (.npz, .h5, .mat, .zarr, .csv) is the format. An existing file is an error
-        unless `replace`.
+        The result file. The end of its name (.npz, .h5, .mat, .csv) is the format. An existing file is an error unless
+        `replace`.
     parameters, outputs
         As in `rosafe.process`, except that `ild`, `ratemap` and `crossCorrelation` are the default outputs, and
         `in_doNormalize` is True by default.
@@ -85,7 +89,8 @@ def process_file(
     topic : str, optional
         The port Audio in a bag; /bass/Audio by default, or the only one.
     resume : bool
-        Skip `target` if it is complete; replace it if it is damaged or older than `source`.
+        Skip `target` if it is complete; replace it if it is damaged or older than `source`. A .mat or .csv is complete
+        if it begins as `process_file` has written it with the same options.
     pad : bool
         Whether the last frames are completed by zeros, as in `rosafe.process`.
     clip : bool
@@ -110,6 +115,9 @@ def process_file(
     file_format = format_of(target)
     check_format(file_format, kinds)
     about = _options_of(source, block_frames, channels, topic, pad, clip)
+    if file_format.extension not in READERS:
+        options = json.dumps([about, values, sorted(kinds)], sort_keys=True, default=list)
+        about = {"options": hashlib.sha256(options.encode()).hexdigest()[:32], **about}
     if resume and os.path.lexists(target):
         if _complete(file_format, Path(target), about, values, kinds) and not _source_modified(source, target):
             return FileResult(0.0, 0, True)
@@ -120,9 +128,9 @@ def process_file(
             raise OutputError(f"{target}: expected another file than the input, got the same")
         if sound.floats:
             values.setdefault("in_doNormalize", False)
-        with new_output(file_format, target, replace) as path:
+        with new_path(target, replace) as path:
             empty = _FileRun(sound, path, file_format, about, values, kinds, progress).run()
-            size = sum(part.stat().st_size for part in path.rglob("*")) if file_format.folder else path.stat().st_size
+            size = path.stat().st_size
         seconds = sound.frames / sound.sample_rate
         return FileResult(seconds, size, False, sound.not_finite, sound.clipped, empty, sound.remark)
 
@@ -147,7 +155,10 @@ def _complete(
 ) -> bool:
     """Return whether the output exists and is complete; OutputError if it is a different file."""
     try:
-        existing = read(file_format, target, arrays=False)
+        if file_format.extension in READERS:
+            different = _differences(read(target, arrays=False), about, values, kinds)
+        else:
+            different = [] if options_in(target) == about["options"] else ["options"]
     except ValueError:
         if file_format.is_one(target):
             return False
@@ -156,18 +167,24 @@ def _complete(
         ) from None
     except OSError as problem:
         raise OutputError(f"{target}: {problem.strerror or problem}") from None
+    if different:
+        raise OutputError(
+            f"{target} was computed with other {different[0]}; choose another -o, or --force computes it again"
+        )
+    return True
+
+
+def _differences(
+    existing: Mapping[str, Any], about: Mapping[str, Any], values: Mapping[str, Any], kinds: Sequence[str]
+) -> list[str]:
+    """Return the names of the options with which an existing result was not computed."""
     names = {name for kind in kinds for name in KINDS[kind].outputs}
     if "clip" in about:  # whether the file contains floats is not known here
         values = {"in_doNormalize": existing["parameters"].get("in_doNormalize"), **values}
     about = {**about, "parameters": effective_parameters(values, kinds, existing["sample_rate"])}
     different = [name for name in about if existing.get(name) != about[name]]
     different += [name for name in _OPTIONS if name in existing and name not in about]
-    different += ["outputs"] if set(existing["axes"]) != names else []
-    if different:
-        raise OutputError(
-            f"{target} was computed with other {different[0]}; choose another -o, or --force computes it again"
-        )
-    return True
+    return [*different, *(["outputs"] if set(existing["axes"]) != names else [])]
 
 
 def _source_modified(source: str | Path, target: str | Path) -> bool:
@@ -255,7 +272,7 @@ class _FileRun:
             {name: part.axes for name, part in parts.items()},
             {name: part.unit for name, part in parts.items()},
             {**{name: value for name, value in described.items() if name not in names}, **times},
-            {"sample_rate": rate, "parameters": parameters, **self._about, **names, "clipped": 0},
+            {**self._about, "sample_rate": rate, "parameters": parameters, **names, "clipped": 0},
         )
 
 

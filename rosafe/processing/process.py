@@ -20,6 +20,7 @@ from rosafe.interface.arguments import check_change, check_parameters
 from rosafe.interface.remarks import no_frames, rate_advice, unknown_argument, warnings_of
 from rosafe.processing import chain
 from rosafe.processing.chain import Chain, FrameLimiter, computed_ears, effective_parameters
+from rosafe.processing.collector import OutputCollector, allocate_branches, join_branches
 from rosafe.processing.signals import (
     as_samples,
     check_finite,
@@ -29,18 +30,17 @@ from rosafe.processing.signals import (
     outputs_of,
     range_warning,
 )
-from rosafe.results.collector import OutputCollector, allocate_branches, join_branches
-from rosafe.results.memory import refuse_over_available
 from rosafe.results.result import Result
 from rosafe.system.version import VERSION
 from rosafe.tree.block import Block
+from rosafe.tree.sizes import refuse_over_available
 from rosafe.tree.workers import workers_to_use
 
 
 def process(
     signal: Any,
     sample_rate: float,
-    *positional: Any,
+    *,
     parameters: Mapping[str, Any] | None = None,
     block_frames: int | Sequence[int] = DEFAULT_FRAMES_PER_BLOCK,
     modifications: Sequence[tuple[int, str, Any]] = (),
@@ -123,11 +123,8 @@ def process(
     """
     if unknown:
         raise unknown_argument(next(iter(unknown)))
-    options = (parameters, block_frames, modifications, outputs)
-    if positional:
-        options = _merge_positional(positional, options)
     try:
-        call = ProcessCall(signal, sample_rate, *options, pad=pad, dtype=dtype)
+        call = ProcessCall(signal, sample_rate, parameters, block_frames, modifications, outputs, pad, dtype)
     except ValueError as problem:
         raise problem.with_traceback(None) from None  # internal frames do not help the caller
     result = call.run()
@@ -137,17 +134,9 @@ def process(
 
 
 process.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-    [p for p in inspect.signature(process).parameters.values() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)],
+    [p for p in inspect.signature(process).parameters.values() if p.kind is not p.VAR_KEYWORD],
     return_annotation="Result",
 )
-
-
-def _merge_positional(positional: tuple[Any, ...], options: tuple[Any, Any, Any, Any]) -> tuple[Any, Any, Any, Any]:
-    """Return the options with those that were given by position, which is deprecated."""
-    if len(positional) > len(options):
-        raise TypeError(f"process: expected 2 positional arguments, got {2 + len(positional)}")
-    warnings.warn("pass arguments after sample_rate by name, as in parameters={...}", DeprecationWarning, 3)
-    return (*positional, *options[len(positional) :])
 
 
 class ProcessCall:

@@ -15,7 +15,7 @@ import numpy as np
 
 from rosafe.audio.files.audiofile import NOT_FINITE, AudioFile, AudioFileError, channels_text
 from rosafe.audio.files.bagsound import BagSoundError, Recording, from_first_samples
-from rosafe.results.memory import check_arrays
+from rosafe.results.hdf5_reading import check_arrays
 from rosafe.tree.sizes import MAX_BYTES, check_memory
 
 BAG = ".bag"
@@ -110,7 +110,7 @@ def read_whole(file: SoundReader) -> np.ndarray:
     size = file.frames * file.channels * (8 if file.floats else 4)
     try:
         if isinstance(file, BagSound):  # its sound can be compressed to almost nothing
-            check_arrays(0, os.path.getsize(file.path), size)
+            check_arrays(os.path.getsize(file.path), size)
         check_memory("its sound", MAX_BYTES, size, "choose a part, as by `ffmpeg -ss 0 -t 600 -i IN OUT.wav`")
     except (OSError, ValueError) as problem:
         raise AudioFileError(f"{file.path}: {problem}") from None

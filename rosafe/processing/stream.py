@@ -18,8 +18,8 @@ from rosafe.interface.remarks import rate_advice, unknown_argument, warnings_of
 from rosafe.processing.chain import axis_values, computed_ears, in_place_kinds, needed
 from rosafe.processing.signals import BlockReader, as_samples, check_finite, frame_times, of_ears, outputs_of
 from rosafe.representations import STAGES
-from rosafe.results.memory import refuse_over_available
 from rosafe.tree import sizes
+from rosafe.tree.sizes import refuse_over_available
 
 _FINISH_FRAMES = 1024  # zeros that `finish` processes at a time
 

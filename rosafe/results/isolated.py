@@ -1,13 +1,11 @@
-"""Program of a child process that reads HDF5 files and Zarr folders: damaged ones can crash or block their libraries.
+"""Program of a child process that reads an HDF5 file: a damaged one can crash or block the library.
 
-It is run by file name and imports nothing of rosafe. Its argument is a JSON object with `kind` (h5, mat or zarr),
-`descriptor` (of the open HDF5 file) or `path` (of the Zarr folder), `arrays` (which to send: all, texts, none or
-asked) and `modules` (folders to import from). It writes to standard output: one byte when the libraries are loaded; the
+It is run by file name and imports nothing of rosafe. Its argument is a JSON object with `descriptor` (of the open file)
+and `modules` (folders to import from). It writes to standard output: one byte when the libraries are loaded; the
 length of the header (8 bytes); the header, a JSON object with `attributes` and a list `arrays` of `name`, `shape`,
-`dtype`, `block` and `attributes`; then the numbers of the arrays, block by block, in row-major order. With `asked`, the
-list has all objects, those that cannot be sent as `name` and `problem`, and standard input has one line for each array
-to be sent: a JSON list of the name and of the rows, null for all. On an error it writes one line to standard error and
-exits with status 1.
+`dtype`, `block` and `attributes`, or of `name` and `problem` for objects that cannot be sent. Standard input has one
+line for each array to be sent: a JSON list of the name and of the rows. If the rows are null, the whole array is sent,
+block by block, in row-major order. On an error the program writes one line to standard error and exits with status 1.
 """
 
 from __future__ import annotations
@@ -25,9 +23,7 @@ import itertools
 import json
 import math
 import os
-import re
 import resource
-import stat
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -38,11 +34,11 @@ MAX_MEMORY = 2**30  # bytes of address space in addition to that of the librarie
 MAX_CHUNK = 2**28  # bytes of a chunk
 MAX_CHUNKS = 2**20  # chunks of an array
 MAX_ARRAYS = 4096  # arrays of a file
-MAX_TEXT = 2**20  # bytes of an attribute or of a file of metadata
+MAX_TEXT = 2**20  # bytes of an attribute
 MAX_TEXTS = 32  # texts of an attribute, one for each axis; all of them can be the same long text of the file
 MAX_HEADER = 2**24  # bytes of the header that is sent
 MAX_SIZE = 2**28  # bytes of all arrays of a small file
-MAX_RATIO = 250  # bytes of all arrays divided by the bytes of a large file; silence in a Zarr has 240
+MAX_RATIO = 250  # bytes of all arrays divided by the bytes of a large file
 BLOCK = 2**22  # bytes, approximately, that are sent at a time
 _STALL = 20  # seconds of processor time for one block; it ends a process whose parent has died
 
@@ -88,15 +84,6 @@ def check_size(taken: float, size: int) -> None:
         raise ValueError(f"its arrays: expected less than {taken / 2**20:.0f} MiB in a file of {size} bytes")
 
 
-# --- HDF5 ---------------------------------------------------------------------------------------------------------
-
-
-def open_h5(descriptor: int) -> tuple[dict[str, Any], list[Array]]:
-    """Return the attributes and the arrays of an HDF5 file; ValueError for references to other files."""
-    file = _h5_file(descriptor)
-    return _h5_attributes("the file", file), [_h5_array(file, name) for name in _h5_names(file)]
-
-
 def _h5_file(descriptor: int) -> Any:
     import h5py
 
@@ -121,8 +108,8 @@ def _allow_no_more_files() -> None:
     os.close(lowest)
 
 
-def _h5_array(file: Any, name: str, other_attributes: bool = False) -> Array:
-    """Return an array of a file; ValueError, also for attributes of other types unless `other_attributes`."""
+def _h5_array(file: Any, name: str) -> Array:
+    """Return an array of a file; ValueError for other objects, and for references to other files."""
     import h5py
     from h5py import h5d, h5o, h5s, h5t, h5z
 
@@ -148,7 +135,7 @@ def _h5_array(file: Any, name: str, other_attributes: bool = False) -> Array:
     if found.get_space().get_simple_extent_type() not in (h5s.SIMPLE, h5s.SCALAR):
         raise ValueError(f"{name}: expected an array, got an empty dataset")
     dataset = h5py.Dataset(found)
-    attributes = _h5_attributes(name, dataset, other_attributes)
+    attributes = _h5_attributes(name, dataset)
     shape, dtype = dataset.shape, dataset.dtype
     check_array(name, shape, dataset.chunks, dtype)
     chunks = dataset.chunks or (1,) * len(shape)
@@ -164,8 +151,8 @@ def _block(shape: tuple[int, ...], chunks: tuple[int, ...], itemsize: int) -> tu
     return tuple(block)
 
 
-def _h5_attributes(name: str, of: Any, others: bool = False) -> dict[str, Any]:
-    """Return attributes; ValueError for other types than numbers and texts, unless `others` are left out."""
+def _h5_attributes(name: str, of: Any) -> dict[str, Any]:
+    """Return the attributes that are numbers or texts; ValueError if one is too large."""
     from h5py import h5s, h5t
 
     found: dict[str, Any] = {}
@@ -174,141 +161,14 @@ def _h5_attributes(name: str, of: Any, others: bool = False) -> dict[str, Any]:
         one = of.attrs.get_id(key)
         kind, space = one.get_type().get_class(), one.get_space().get_simple_extent_type()
         if kind not in (h5t.INTEGER, h5t.FLOAT, h5t.STRING) or space == h5s.NULL:
-            if others:
-                continue
-            raise ValueError(f"{name}: expected attributes that are numbers or texts, got another type")
+            continue
         texts = one.get_space().get_simple_extent_npoints() if kind == h5t.STRING else 0
         if one.get_storage_size() > MAX_TEXT or texts > MAX_TEXTS:
             raise ValueError(f"{name}: expected attributes of at most {MAX_TEXT // 2**20} MiB, got a larger one")
         value = of.attrs[key]
         value = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
-        found[attribute] = value.decode(errors="replace" if others else "strict") if isinstance(value, bytes) else value
+        found[attribute] = value.decode(errors="replace") if isinstance(value, bytes) else value
     return found
-
-
-# --- Zarr ---------------------------------------------------------------------------------------------------------
-
-_CODECS = ("blosc", "zlib", "gzip", "zstd", "lz4", "bz2", "lzma")
-_FILLS = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf, None: 0}
-
-
-def open_zarr(path: str) -> tuple[dict[str, Any], list[Array]]:
-    """Return the attributes and the arrays of a Zarr group of format 2; ValueError for codecs that are not in the list.
-
-    Only regular files in the folder are opened, and no symbolic links. The zarr library is not used, because it loads
-    any codec that a file names.
-    """
-    root = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    names = [name for name in sorted(os.listdir(root)) if not name.startswith(".")]
-    if len(names) > MAX_ARRAYS:
-        raise ValueError(f"expected at most {MAX_ARRAYS} objects, got {len(names)}")
-    if "zarr.json" in names:
-        raise ValueError("expected a Zarr of format 2, got format 3")
-    if _metadata(root, ".zgroup").get("zarr_format") != 2:
-        raise ValueError("expected a Zarr group of format 2")
-    attributes = _metadata(root, ".zattrs")
-    consolidated = _metadata(root, ".zmetadata", 16).get("metadata", {}) if _exists(root, ".zmetadata") else {}
-    if not isinstance(consolidated, dict):
-        raise ValueError(".zmetadata: expected an object of metadata")
-    for name, metadata in consolidated.items():
-        if name.endswith(".zarray"):
-            _checked(_quoted(name), metadata)
-    return attributes, [_zarr_array(root, name) for name in names]
-
-
-def _open_in_folder(folder: int, name: str, flags: int = os.O_NONBLOCK) -> int:
-    try:
-        return os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | flags, dir_fd=folder)
-    except OSError as problem:
-        raise ValueError(f"{_quoted(name)}: {problem.strerror}") from None
-
-
-def _exists(folder: int, name: str) -> bool:
-    try:
-        os.stat(name, dir_fd=folder, follow_symlinks=False)
-    except FileNotFoundError:
-        return False
-    return True
-
-
-def _content(folder: int, name: str, max_size: int) -> bytes:
-    """Return the contents of a regular file."""
-    with open(_open_in_folder(folder, name), "rb") as file:
-        found = os.fstat(file.fileno())
-        if not stat.S_ISREG(found.st_mode):
-            raise ValueError(f"{_quoted(name)}: expected a regular file")
-        if found.st_size > max_size:
-            raise ValueError(f"{_quoted(name)}: expected at most {max_size} bytes, got {found.st_size}")
-        return file.read(found.st_size)
-
-
-def _metadata(folder: int, name: str, max_texts: int = 1) -> dict[str, Any]:
-    try:
-        found = json.loads(_content(folder, name, max_texts * MAX_TEXT))
-    except RecursionError:
-        raise ValueError(f"{name}: nested too deeply") from None
-    if not isinstance(found, dict):
-        raise ValueError(f"{name}: expected an object")
-    return found
-
-
-def _checked(name: str, metadata: Any) -> tuple[tuple[int, ...], tuple[int, ...], np.dtype[Any], Any]:
-    """Return shape, chunks, type and codec of an array; ValueError if one is not supported."""
-    metadata = metadata if isinstance(metadata, dict) else {}
-    if metadata.get("zarr_format") != 2:
-        raise ValueError(f"{name}: expected an array of format 2")
-    if metadata.get("filters"):
-        raise ValueError(f"{name}: expected no filters")
-    codec = _codec(name, metadata.get("compressor"))
-    if metadata.get("dimension_separator", ".") != "." or metadata.get("order") not in ("C", "F"):
-        raise ValueError(f"{name}: expected order C or F, and dimension_separator .")
-    dtype = metadata.get("dtype")
-    if not isinstance(dtype, str) or not re.fullmatch("[<>|][fiu][1248]", dtype):
-        raise ValueError(f"{name}: expected an array of numbers")
-    shape, chunks = (_lengths(name, metadata.get(key)) for key in ("shape", "chunks"))
-    check_array(name, shape, chunks, np.dtype(dtype))
-    return shape, chunks, np.dtype(dtype), codec
-
-
-def _codec(name: str, compressor: Any) -> str | None:
-    codec = compressor.get("id") if isinstance(compressor, dict) else compressor
-    if not (codec is None or (isinstance(codec, str) and codec in _CODECS)):
-        raise ValueError(f"{name}: expected one of the codecs {', '.join(_CODECS)} or none, got another one")
-    return codec
-
-
-def _lengths(name: str, lengths: Any) -> tuple[int, ...]:
-    if not isinstance(lengths, list) or len(lengths) > 32 or not all(type(n) is int for n in lengths):
-        raise ValueError(f"{name}: shape and chunks: expected lists of integers")
-    return tuple(lengths)
-
-
-def _zarr_array(root: int, name: str) -> Array:
-    from numcodecs import registry
-
-    folder = _open_in_folder(root, name, os.O_DIRECTORY)
-    name = _quoted(name) if not name.isidentifier() else name
-    if _exists(folder, "zarr.json") or not _exists(folder, ".zarray"):
-        raise ValueError(f"{name}: expected an array of format 2")
-    metadata = _metadata(folder, ".zarray")
-    shape, chunks, dtype, codec = _checked(name, metadata)
-    fill = metadata.get("fill_value")
-    if not (fill in _FILLS if isinstance(fill, str) or fill is None else isinstance(fill, (int, float))):
-        raise ValueError(f"{name}: fill_value: expected a number")
-    empty = np.array(_FILLS.get(fill, fill)).astype(dtype)
-    decode = registry.get_codec({"id": codec}).decode if codec else bytes
-
-    def read(slices: Slices) -> np.ndarray:
-        key = ".".join(str(part.start // chunk) for part, chunk in zip(slices, chunks, strict=True)) or "0"
-        whole = tuple(slice(part.stop - part.start) for part in slices)
-        if not _exists(folder, key):
-            return np.full([part.stop for part in whole], empty)
-        data = np.frombuffer(decode(_content(folder, key, 2 * MAX_CHUNK)), np.uint8)
-        if data.size != math.prod(chunks) * dtype.itemsize:
-            raise ValueError(f"{name}: expected chunks of {math.prod(chunks) * dtype.itemsize} bytes, got {data.size}")
-        return data.view(dtype).reshape(chunks, order=metadata["order"])[whole]
-
-    return Array(name, shape, dtype, chunks, {}, read)
 
 
 # --- the process --------------------------------------------------------------------------------------------------
@@ -335,14 +195,6 @@ def _quoted(name: str) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def _size_on_disk(file: int | str) -> int:
-    """Return the bytes of an open file, or of all files of a Zarr folder."""
-    if isinstance(file, int):
-        return os.fstat(file).st_size
-    folders = [file, *(one.path for one in os.scandir(file) if one.is_dir(follow_symlinks=False))]
-    return sum(one.stat(follow_symlinks=False).st_size for folder in folders for one in os.scandir(folder))
-
-
 def _send(data: memoryview) -> None:
     while data:
         data = data[os.write(1, data) :]
@@ -354,11 +206,6 @@ def _more_time() -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
 
 
-def _is_text(array: Array) -> bool:
-    """Return whether an array is a text or a single number of MATLAB."""
-    return array.attributes.get("MATLAB_class") == "char" or math.prod(array.shape) == 1
-
-
 def _send_header(attributes: dict[str, Any], arrays: list[dict[str, Any]]) -> None:
     head = json.dumps({"attributes": attributes, "arrays": arrays}).encode()
     if len(head) > MAX_HEADER:
@@ -366,45 +213,26 @@ def _send_header(attributes: dict[str, Any], arrays: list[dict[str, Any]]) -> No
     _send(memoryview(len(head).to_bytes(8, "little") + head))
 
 
-def _described(array: Array) -> dict[str, Any]:
-    return {**array._asdict(), "dtype": array.dtype.str, "read": None}
-
-
-def _send_numbers(array: Array, slices: Any) -> None:
-    _more_time()
-    data = np.ascontiguousarray(array.read(slices), array.dtype).reshape(-1)
-    _send(data.view(np.uint8).data)
-
-
-def send(file: int | str, which: str) -> None:
-    """Check a file, and write its contents to the standard output."""
-    size = _size_on_disk(file)
-    attributes, arrays = open_h5(file) if isinstance(file, int) else open_zarr(file)
-    check_size(sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays), size)
-    if which != "all":
-        arrays = [one for one in arrays if which == "texts" and _is_text(one)]
-    _send_header(attributes, [_described(array) for array in arrays])
-    for array in arrays:
-        for slices in blocks(array.shape, array.block):
-            _send_numbers(array, slices)
-
-
 def answer(descriptor: int) -> None:
-    """Write the parts of an HDF5 file that the standard input asks for."""
-    size, file = _size_on_disk(descriptor), _h5_file(descriptor)
+    """Write the description of an HDF5 file, and the arrays that the standard input asks for."""
+    size, file = os.fstat(descriptor).st_size, _h5_file(descriptor)
     arrays, described = {}, []
     for name in _h5_names(file):
         try:
-            arrays[name] = _h5_array(file, name, other_attributes=True)
-            described.append({**_described(arrays[name]), "name": name})
+            array = arrays[name] = _h5_array(file, name)
+            described.append({**array._asdict(), "name": name, "dtype": array.dtype.str, "read": None})
         except Exception as problem:  # as in `main`; it matters only if this object is needed
             described.append({"name": name, "problem": _reason(problem)})
-    _send_header(_h5_attributes("the file", file, others=True), described)
+    _send_header(_h5_attributes("the file", file), described)
     for line in sys.stdin:
         name, rows = json.loads(line)
-        shape = arrays[name].shape
-        check_size(math.prod(shape if rows is None else (len(rows), *shape[1:])) * arrays[name].dtype.itemsize, size)
-        _send_numbers(arrays[name], () if rows is None else rows)
+        array = arrays[name]
+        shape = array.shape if rows is None else (len(rows), *array.shape[1:])
+        check_size(math.prod(shape) * array.dtype.itemsize, size)
+        for part in blocks(shape, array.block) if rows is None else [rows]:
+            _more_time()
+            data = np.ascontiguousarray(array.read(part), array.dtype).reshape(-1)
+            _send(data.view(np.uint8).data)
 
 
 def _reason(problem: Exception) -> str:
@@ -413,21 +241,15 @@ def _reason(problem: Exception) -> str:
 
 def main() -> None:
     """Run the program."""
-    request = json.loads(sys.argv[1])
     limit(resource.RLIMIT_CORE, 0)
     limit(resource.RLIMIT_FSIZE, 0)
-    if request["kind"] == "zarr":
-        import numcodecs  # noqa: F401
-    else:
-        import h5py  # noqa: F401
+    import h5py  # noqa: F401
+
     limit(resource.RLIMIT_AS, _address_space() + MAX_MEMORY)
     _send(memoryview(b"+"))
     try:
         _more_time()
-        if request["arrays"] == "asked":
-            answer(request["descriptor"])
-        else:
-            send(request.get("path", request.get("descriptor")), request["arrays"])
+        answer(json.loads(sys.argv[1])["descriptor"])
     except MemoryError:
         sys.exit(f"expected at most {MAX_MEMORY // 2**20} MiB of memory for reading it")
     except Exception as problem:  # on damaged files the libraries raise any exception

@@ -1,29 +1,34 @@
-"""Read .npz and .csv. Sizes and types are checked before memory is allocated."""
+"""`load`: read .npz and .h5. Sizes and types are checked before memory is allocated."""
 
 from __future__ import annotations
 
 import functools
+import importlib.util
 import math
 import os
 import re
 import sys
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, Any
 
 import numpy as np
 
+from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import short_repr
-from rosafe.results.in_memory_formats import CSV_HEAD
-from rosafe.results.memory import check_arrays
-from rosafe.results.result_metadata import ABOUT, MAX_TEXT, checked, from_json, is_number, new_array, parse_metadata
+from rosafe.interface import KINDS, Representation
+from rosafe.results.hdf5_reading import check_arrays, open_hdf5
+from rosafe.results.result import Result
+from rosafe.results.result_metadata import ABOUT, is_texts, new_array, parse_metadata, sample_times
 from rosafe.system.input import open_regular
+from rosafe.system.missing import require
 
 _MAX_MEMBERS = 4096  # members of an .npz
 _MAX_HEADER = 4096  # bytes of the header of an array
+_MAX_EMPTY = 2**20  # along each axis of an array without numbers
 _BLOCK = 2**20  # bytes read at a time
 _MAGIC = re.compile(rb"\x93NUMPY[\x01-\x03]\x00", re.DOTALL)
 _HEADER = re.compile(
@@ -40,15 +45,105 @@ _DAMAGED = (
     TypeError,
 )
 _ENCRYPTED = 1  # flag of a member
-_MAX_NUMBER_LENGTH = 32  # characters of a number in a .csv; repr makes at most 24
-_MAX_CSV_HEAD = 2**24  # bytes
+# The reader of files that are no results, by suffix
+_OTHERS = {
+    ".mat": "scipy.io.loadmat, or h5py if it is of version 7.3,",
+    ".csv": "pandas.read_csv or numpy.loadtxt",
+    ".zarr": "xarray.open_zarr",
+    ".nc": "xarray.open_dataset",
+    ".wav": "soundfile.read",
+}
 
 
-def read_npz(path: Path, arrays: bool = True) -> dict[str, Any]:
-    """Return the contents of an .npz; without `arrays`, only the metadata. ValueError if it is damaged."""
-    with open_npz(path) as (members, read):
-        found = {name: read(one) for name, one in members.items() if arrays or name in ABOUT}
+def load(path: str | os.PathLike[str]) -> Result:
+    """Read a .npz or .h5 that `rosafe process` or `Result.save` has written.
+
+    Parameters
+    ----------
+    path : path
+        It ends in .npz or .h5.
+
+    Returns
+    -------
+    Result
+        The result of `rosafe.process` for the same samples, with the same bits, keys and attributes. If
+        `rosafe process` has written it, it also has the keys `block_frames`, `source` (name of the input), `channels`
+        and `topic` if they were given, `pad` and `clip`.
+
+    Raises
+    ------
+    ValueError
+        It is not a result file, or it is damaged, or it has another format: the text names the reader to use.
+    OSError
+        It does not exist, or cannot be read.
+    ModuleNotFoundError
+        h5py is not installed.
+    """
+    result = read(path)
+    try:
+        _check_arrays(result)
+    except ValueError as problem:
+        raise _damaged(path, problem) from None
+    for kind in KINDS.values():  # times of samples are not stored
+        stored = [name for name in kind.outputs if name in result["axes"]]
+        if stored and f"{kind.kind}_time" not in result:
+            result[f"{kind.kind}_time"] = sample_times(result[stored[0]].shape[-1], result["sample_rate"])
+    if result.pop("dtype", "") == "float32":
+        result |= {name: result[name].astype(np.float32) for name in result["axes"]}
+    return Result(
+        result,
+        parameters=result["parameters"],
+        sample_rate=result["sample_rate"],
+        version=result.get("rosafe_version", ""),
+        clipped=result.get("clipped", 0),
+    )
+
+
+def read(path: str | os.PathLike[str], arrays: bool = True) -> dict[str, Any]:
+    """Return the contents of a file; without `arrays`, only the metadata. Raises the errors of `load`."""
+    extension = Path(path).suffix.lower()
+    if extension not in READERS:
+        other = (
+            f"{_OTHERS[extension]} reads it" if extension in _OTHERS else "rosafe process and Result.save write them"
+        )
+        raise ValueError(f"{path}: expected a name that ends in {' or '.join(READERS)}, got {extension!r}; {other}")
+    if not os.path.exists(path):
+        raise FileNotFoundError(2, os.strerror(2), str(path))
+    if extension == ".h5" and not importlib.util.find_spec("h5py"):  # the child process imports it
+        require("h5py", ".h5 files")
+    try:
+        result = READERS[extension](Path(path), arrays)
+    except (ValueError, OverflowError, RecursionError, MemoryError) as problem:  # json.JSONDecodeError, too
+        raise _damaged(path, problem) from None
+    for name in ("axes", "parameters", "sample_rate"):
+        if name not in result:
+            raise _damaged(path, f"it lacks {name}")
+    return result
+
+
+# --- .h5 ----------------------------------------------------------------------------------------------------------
+
+
+def _read_h5(path: Path, arrays: bool) -> dict[str, Any]:
+    with open_hdf5(path) as content:
+        about = parse_metadata(content.attrs)
+        found = {name: content[name] for name in content}
+        check_arrays(os.path.getsize(path), sum(math.prod(one.shape, start=8.0) for one in found.values()))
+        if not arrays:
+            return about
+        return {**{name: one[()] if one.shape else float(one[()]) for name, one in found.items()}, **about}
+
+
+# --- .npz ---------------------------------------------------------------------------------------------------------
+
+
+def _read_npz(path: Path, arrays: bool) -> dict[str, Any]:
+    with open_npz(path) as (members, read_array):
+        found = {name: read_array(one) for name, one in members.items() if arrays or name in ABOUT}
     return {**found, **parse_metadata({name: value for name, value in found.items() if value.ndim == 0})}
+
+
+READERS: dict[str, Callable[[Path, bool], dict[str, Any]]] = {".npz": _read_npz, ".h5": _read_h5}
 
 
 @contextmanager
@@ -71,7 +166,7 @@ def _members(file: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
     for one in members:
         if one.flag_bits & _ENCRYPTED or one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise ValueError("expected arrays that are stored or deflated, and not encrypted")
-    check_arrays(0, size, sum(one.file_size for one in members))
+    check_arrays(size, sum(one.file_size for one in members))
     return {one.filename.removesuffix(".npy"): one for one in members}
 
 
@@ -118,52 +213,57 @@ def _fill(content: IO[bytes], buffer: memoryview) -> None:
         raise ValueError("expected the end of an array, got more bytes")
 
 
-def read_csv(path: Path, arrays: bool = True) -> dict[str, Any]:
-    """As `read_npz`, for a .csv."""
-    with open_regular(path) as file:
-        head = file.readline(_MAX_CSV_HEAD)
-        begin = CSV_HEAD.encode()
-        if not head.startswith(begin):
-            raise ValueError("line 1: expected the first line that rosafe process writes")
-        about = from_json(head.removeprefix(begin), _MAX_CSV_HEAD)
-        if not isinstance(about, dict) or not isinstance(about.get("axes"), dict) or len(about["axes"]) != 1:
-            raise ValueError("line 1: expected the description of one output")
-        fixed, rows = about.pop("fixed", None), about.pop("rows", None)
-        about = checked(about)
-        if not arrays:
-            return about
-        if not isinstance(fixed, dict) or type(rows) is not int:
-            raise ValueError("line 1: expected the description of the rows")
-        vectors = {name: _vector(name, value) for name, value in fixed.items()}
-        time, *columns = file.readline(MAX_TEXT).decode().rstrip("\r\n").split(",")
-        table = _table(file, rows, 1 + len(columns))
-    (name,) = about["axes"]
-    return {name: np.ascontiguousarray(table[:, 1:].T), time: table[:, 0].copy(), **vectors, **about}
+# --- checks -------------------------------------------------------------------------------------------------------
 
 
-def _vector(name: str, value: Any) -> np.ndarray | float:
-    values = value if isinstance(value, list) else [value]
-    if not all(map(is_number, values)):
-        raise ValueError(f"{ascii(name)[:80]}: expected numbers")
-    vector = np.array(values, np.float64)
-    return vector if isinstance(value, list) else float(vector[0])
+def _check_arrays(result: Mapping[str, Any]) -> None:
+    """Raise ValueError if outputs or coordinates are missing or have another type."""
+    missing = result["axes"].keys() - result.keys()
+    if missing:
+        raise ValueError(f"it lacks {', '.join(map(short_repr, sorted(missing)))}")
+    for name, axes in result["axes"].items():
+        _check_array(name, result[name], len(axes))
+    for kind in KINDS.values():
+        _check_outputs(kind, result)
+        _check_coordinates(kind, result)
 
 
-def _table(file: BinaryIO, rows: int, width: int) -> np.ndarray:
-    """Read the rows of a .csv, each of `width` numbers."""
-    size = os.fstat(file.fileno()).st_size
-    if not 0 <= 2 * rows * width <= size:  # a digit and a comma for each number
-        raise ValueError(f"expected {rows} rows, got a file of {size} bytes: it is cut off")
-    check_arrays(0, size, 16 * rows * width)
-    table = new_array((rows, width), np.dtype(np.float64))
-    for index, row in enumerate(table):
-        numbers = file.readline(_MAX_NUMBER_LENGTH * width).split(b",")
-        if len(numbers) != width:
-            raise ValueError(f"row {index + 1} of {rows}: expected {width} numbers: it is cut off or damaged")
-        try:
-            row[:] = [float(number) for number in numbers]
-        except ValueError:
-            raise ValueError(f"row {index + 1}: expected numbers") from None
-    if file.read(1):
-        raise ValueError(f"expected {rows} rows, got more")
-    return table
+def _check_outputs(kind: Representation, result: Mapping[str, Any]) -> None:
+    """Raise ValueError if axes or times of the outputs of a kind do not match its declaration."""
+    outputs = [name for name in kind.outputs if name in result]
+    for name in outputs:
+        if result["axes"].get(name) != kind.outputs[name].axes:
+            raise ValueError(f"axes: {name}: expected {', '.join(kind.outputs[name].axes)}")
+        if kind.outputs[name].axes[0] == "ear" and not 1 <= len(result[name]) <= 2:
+            raise ValueError(f"{name}: expected one or two ears, got {len(result[name])}")
+    time = f"{kind.kind}_time"
+    if outputs and time in result:
+        _check_array(time, result[time], 1)
+        if any(result[name].shape[-1] != len(result[time]) for name in outputs):
+            raise ValueError(f"{time}: expected the length of {outputs[0]}, got {len(result[time])}")
+
+
+def _check_coordinates(kind: Representation, result: Mapping[str, Any]) -> None:
+    """Raise ValueError if the frame rate or a coordinate of a kind does not match its declaration."""
+    rate = result.get(f"{kind.kind}_frameRate", 1.0)
+    if not is_number(rate) or not 0 < rate < math.inf:
+        raise ValueError(f"{kind.kind}_frameRate: expected a positive number, got {short_repr(rate)}")
+    units = {one.name: one.unit for one in kind.parameters} | {one.name: one.unit for one in kind.derived}
+    for name in kind.coordinates:
+        if units[name]:
+            _check_array(name, result.get(name, np.empty(0)), 1)
+        elif not is_texts(result.get(name, ())):
+            raise ValueError(f"{name}: expected texts")
+
+
+def _check_array(name: str, value: Any, dimensions: int) -> None:
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu" or value.dtype.itemsize < 4:
+        raise ValueError(f"{short_repr(name)}: expected an array of numbers of 32 or 64 bits")
+    if value.ndim != dimensions or (not value.size and max(value.shape) > _MAX_EMPTY):
+        raise ValueError(f"{short_repr(name)}: expected {dimensions} axes, got the shape {value.shape}")
+
+
+def _damaged(path: str | os.PathLike[str], reason: object) -> ValueError:
+    return ValueError(
+        f"{path}: expected a result of rosafe process, got another or damaged file: {reason}; compute the result again"
+    )

@@ -6,12 +6,19 @@ import copy
 import html
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import needed
+from rosafe.results.formats import check_format, format_of
+from rosafe.results.result_metadata import Contents
+from rosafe.system.output import new_path
+from rosafe.view.dataset import to_xarray
+from rosafe.view.plot import plot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -131,23 +138,19 @@ class Result(dict[str, Any]):
         matplotlib.figure.Figure
             As of `rosafe.plot`.
         """
-        import rosafe
-
-        return rosafe.plot(self, outputs, ax, **options)
+        return plot(self, outputs, ax, **options)
 
     def to_xarray(self) -> Dataset:
         """Return an xarray Dataset, as `rosafe.to_xarray`."""
-        import rosafe
-
-        return rosafe.to_xarray(self)
+        return to_xarray(self)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a file that `rosafe.load` reads. An existing file is replaced.
+        """Write a file. An existing file is replaced.
 
         Parameters
         ----------
         path : path
-            The end of its name (.npz, .h5, .mat, .zarr, .csv) selects the format.
+            The end of its name (.npz, .h5, .mat, .csv) selects the format. `rosafe.load` reads .npz and .h5.
 
         Raises
         ------
@@ -156,11 +159,35 @@ class Result(dict[str, Any]):
         rosafe.system.output.OutputError
             The file cannot be written.
         ModuleNotFoundError
-            h5py or zarr is not installed.
+            h5py is not installed.
         """
-        from rosafe.results.formats import save
+        file_format = format_of(path)
+        check_format(file_format, self.kinds)
+        contents = self._contents()
+        writer_class = file_format.writer(contents)
+        with new_path(Path(path), replace=True) as part, closing(writer_class(part, contents)) as writer:
+            for name in self.axes:
+                writer.append(name, np.asarray(self[name], np.float64))
+            writer.finish()
 
-        save(self, path)
+    def _contents(self) -> Contents:
+        axes, units = self.axes, self.units
+        times = {f"{kind}_time" for kind in self.kinds if f"{kind}_frameRate" not in self}  # of samples: not stored
+        coordinates = {name: self[name] for name in self if name in units.keys() - axes.keys() - times}
+        names = {name: value for name, value in coordinates.items() if isinstance(value, list)}
+        options = ("source", "block_frames", "channels", "topic", "pad", "clip")
+        about = {name: self[name] for name in options if name in self}
+        about |= {"rosafe_version": self.version, "sample_rate": self.sample_rate, "parameters": self.parameters}
+        about |= {"clipped": self.clipped, **names}
+        if any(self[name].dtype == np.float32 for name in axes):
+            about["dtype"] = "float32"
+        return Contents(
+            {name: self[name].shape for name in axes},
+            axes,
+            {name: units[name] for name in axes},
+            {name: value for name, value in coordinates.items() if name not in names},
+            about,
+        )
 
     def __repr__(self) -> str:
         outputs = ", ".join(f"{name} {np.shape(self[name])}{unit}" for name, unit in self._outputs())

@@ -1,17 +1,16 @@
-"""The contents of a result file, independent of its format, and the base class of the writers."""
+"""The contents of a result file, independent of its format."""
 
 from __future__ import annotations
 
 import json
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+
+from rosafe.declarations.checks import is_number
 
 # entries by which runs can be compared
 ABOUT = (
@@ -19,7 +18,7 @@ ABOUT = (
     *("pad", "clip"),
 )
 MAX_TEXT = 2**20  # characters of a text in a file
-_TEXTS = {"source", "topic", "rosafe_version", "dtype"}  # stored as they are; other texts are JSON
+_TEXTS = {"source", "topic", "rosafe_version", "dtype", "options"}  # stored as they are; other texts are JSON
 
 
 @dataclass
@@ -36,8 +35,8 @@ class Contents:
         Coordinates and rates. The times of samples are omitted, because they follow from the sample rate.
     about : dict
         `parameters`, `sample_rate` (Hz), `block_frames`, `source` (the name of the input), `rosafe_version`, further
-        options of the run, `clipped` (a number of samples, which may change until `ResultWriter.finish`), and
-        coordinates that are names.
+        options of the run, `clipped` (a number of samples, which may change until `ResultWriter.finish`),
+        coordinates that are names, and, for formats that are written only, `options` (a digest of the options).
     """
 
     shapes: dict[str, tuple[int, ...]]
@@ -51,59 +50,10 @@ class Contents:
         """Bytes of all arrays."""
         return sum(8 * math.prod(shape) for shape in self.shapes.values())
 
-    def dimensions(self, name: str) -> tuple[str, ...]:
-        """Return names for the axes of an array that are unique in the file: equal names have equal lengths."""
-        if name not in self.axes:
-            return (name,)
-        kind = name.partition("_")[0]
-        return tuple(axis if axis in ("ear", "channel") else f"{kind}_{axis}" for axis in self.axes[name])
-
     def flat(self) -> dict[str, float | str]:
         """Return everything except arrays, as numbers and texts."""
         everything: dict[str, Any] = {**self.about, "axes": self.axes, "units": self.units}
         return {k: v if isinstance(v, (int, float)) or k in _TEXTS else json.dumps(v) for k, v in everything.items()}
-
-
-class ResultWriter(ABC):
-    """Writes the arrays block by block. Different arrays may be appended concurrently by different threads.
-
-    Parameters
-    ----------
-    path : Path
-        An empty file, or an empty folder.
-    contents : Contents
-    """
-
-    def __init__(self, path: Path, contents: Contents) -> None:
-        self._path = path
-        self._contents = contents
-        self._open = ExitStack()
-        try:
-            self._begin()
-        except BaseException:
-            self.close()
-            raise
-
-    @classmethod
-    def size(cls, contents: Contents) -> int:
-        """Return the maximum number of bytes on the disk while it is written."""
-        return contents.size
-
-    @abstractmethod
-    def _begin(self) -> None:
-        """Prepare for the first block."""
-
-    @abstractmethod
-    def append(self, name: str, block: np.ndarray) -> None:
-        """Append a block to an array, along the last axis."""
-
-    @abstractmethod
-    def finish(self) -> None:
-        """Complete the file."""
-
-    def close(self) -> None:
-        """Close the file, complete or not, and release all resources."""
-        self._open.close()
 
 
 def parse_metadata(flat: Mapping[str, Any]) -> dict[str, Any]:
@@ -114,24 +64,7 @@ def parse_metadata(flat: Mapping[str, Any]) -> dict[str, Any]:
     about: dict[str, Any] = {}
     for name, value in flat.items():
         value = value.item() if isinstance(value, (np.ndarray, np.generic)) else value
-        if isinstance(value, bytes):
-            value = value.decode()
         about[name] = from_json(value) if isinstance(value, str) and name not in _TEXTS else value
-    return checked(about)
-
-
-def from_json(text: str | bytes, max_length: int = MAX_TEXT) -> Any:
-    """Return the value of a JSON text; ValueError if it is longer than `max_length` or invalid."""
-    if len(text) > max_length:
-        raise ValueError(f"expected a text of at most {max_length} characters, got {len(text)}")
-    try:
-        return json.loads(text)
-    except RecursionError:
-        raise ValueError("a text is nested too deeply") from None
-
-
-def checked(about: dict[str, Any]) -> dict[str, Any]:
-    """Return `about` with Python's types; ValueError for types other than those of `Contents`."""
     for name, (expected, fits) in _TYPES.items():
         if name in about and not fits(about[name]):
             raise ValueError(f"{name}: expected {expected}")
@@ -142,9 +75,14 @@ def checked(about: dict[str, Any]) -> dict[str, Any]:
     return about
 
 
-def is_number(value: Any) -> bool:
-    """Return whether `value` is a real number, possibly infinite or NaN."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+def from_json(text: str) -> Any:
+    """Return the value of a JSON text; ValueError if it is longer than `MAX_TEXT` or invalid."""
+    if len(text) > MAX_TEXT:
+        raise ValueError(f"expected a text of at most {MAX_TEXT} characters, got {len(text)}")
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("a text is nested too deeply") from None
 
 
 def _is_positive(value: Any) -> bool:
@@ -193,18 +131,6 @@ def new_array(shape: tuple[int, ...], dtype: np.dtype[Any], order: Literal["C", 
         raise ValueError("an array does not fit into the memory") from None
 
 
-def restored(array: np.ndarray, axes: tuple[str, ...] | None) -> np.ndarray:
-    """Return an array in its shape before MATLAB dropped trailing axes of length 1 or added an axis to a vector."""
-    if axes is None:
-        return array.ravel()
-    return array.reshape(array.shape + (1,) * (len(axes) - array.ndim))
-
-
 def sample_times(count: int, sample_rate: float) -> np.ndarray:
     """Return the time of each sample (s), as `rosafe.processing.signals.frame_times`."""
     return np.arange(count) / sample_rate
-
-
-def is_scalar(name: str) -> bool:
-    """Return whether an entry is a number, in formats that cannot distinguish it from a vector of length 1."""
-    return name in ("sample_rate", "block_frames", "clipped", "pad", "clip") or name.endswith("_frameRate")

@@ -13,7 +13,6 @@ _PACKAGES = {
     "matplotlib": ("plot", ""),
     "h5py": ("files", ""),
     "xarray": ("files", "python3-xarray"),
-    "zarr": ("files", "python3-zarr"),
     "distributed": ("dask", "python3-distributed"),
     "dask": ("dask", "python3-distributed"),
     "torch": ("torch", ""),

@@ -1,4 +1,4 @@
-"""Atomic output: a file or folder appears only when it is complete, and has one writer at a time."""
+"""Atomic output: a file appears only when it is complete, and has one writer at a time."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import contextlib
 import errno
 import fcntl
 import os
-import shutil
 import stat
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -65,7 +64,9 @@ class AtomicOutput:
         self._begun = self.keep = False
         self._mode = mode
         try:
-            self.descriptor = _locked(self.name, self._open)
+            self.descriptor = self._open()
+        except BlockingIOError:
+            raise self.error(BlockingIOError(errno.EAGAIN, "another process is writing it")) from None
         except OSError as problem:
             raise self.error(problem) from None
         if keep_leftover and not replace and self._left_over():
@@ -75,13 +76,25 @@ class AtomicOutput:
             )
 
     def _open(self) -> int:
+        """Return the locked part; BlockingIOError if another process has locked it."""
         flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-        descriptor = os.open(self.name, flags, self._mode)
-        found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
-            os.close(descriptor)
-            raise OSError(errno.EEXIST, f"{self.name} exists and is not a regular file with one link")
-        return descriptor
+        while True:
+            with contextlib.ExitStack() as closing:
+                descriptor = os.open(self.name, flags, self._mode)
+                closing.callback(os.close, descriptor)
+                found = os.fstat(descriptor)
+                if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+                    raise OSError(errno.EEXIST, f"{self.name} exists and is not a regular file with one link")
+                lock_file(descriptor)
+                if self._is_there(descriptor):  # otherwise its owner has just moved or removed it: try again
+                    closing.pop_all()
+                    return descriptor
+
+    def _is_there(self, descriptor: int) -> bool:
+        try:
+            return os.path.samestat(self.name.lstat(), os.fstat(descriptor))
+        except FileNotFoundError:
+            return False
 
     def _left_over(self) -> bool:
         return not self._begun and os.fstat(self.descriptor).st_size > 0
@@ -95,7 +108,7 @@ class AtomicOutput:
     def complete(self) -> None:
         """Rename the part to the target; FileExistsError if that was created meanwhile, or another OSError."""
         os.fsync(self.descriptor)  # otherwise a power cut could leave an empty file of that name
-        if not _is_at(self.name, self.descriptor):
+        if not self._is_there(self.descriptor):
             raise FileNotFoundError(errno.ENOENT, f"{self.name} has been removed")
         if not self._replace and os.path.lexists(self._path):
             raise FileExistsError(errno.EEXIST, "it was created meanwhile")
@@ -105,7 +118,7 @@ class AtomicOutput:
 
     def close(self) -> None:
         """Unlock the part, and remove it unless it is complete, to be kept, or an unchanged leftover."""
-        if not (self.keep or self._left_over()) and _is_at(self.name, self.descriptor):
+        if not (self.keep or self._left_over()) and self._is_there(self.descriptor):
             self.name.unlink()
         os.close(self.descriptor)
 
@@ -144,70 +157,6 @@ def _new_part(target: str | Path, replace: bool, mode: int = 0o666) -> Iterator[
         part.close()
 
 
-@contextmanager
-def new_folder(target: str | Path, replace: bool, marker_file: str) -> Iterator[Path]:
-    """Yield an empty folder that becomes `target` on success and is removed on failure.
-
-    As for `AtomicOutput`, its name has the suffix ``.part`` until then, it is locked, and a leftover is overwritten.
-
-    Parameters
-    ----------
-    target : path
-        The path of the folder; links are followed.
-    replace : bool
-        Whether it may replace an existing folder that contains `marker_file`.
-    marker_file : str
-        The name of a file by which folders of this kind are recognised.
-
-    Raises
-    ------
-    OutputError
-        The target exists, or another process is writing it, or it cannot be written; and for an OSError in the body.
-    """
-    path = _real(target)
-    try:
-        if os.path.lexists(path):
-            _check_replaceable(Path(target), path, replace, marker_file)
-        elif not path.parent.is_dir():
-            raise OutputError(f"cannot write {target}: the folder {path.parent} does not exist")
-        part = path.with_name(path.name + PART)
-        descriptor = _locked(part, lambda: _open_folder(part))
-        try:
-            for leftover in part.iterdir():
-                _remove(leftover)
-            yield part
-            sync_tree(part)
-            if not _is_at(part, descriptor):
-                raise FileNotFoundError(errno.ENOENT, f"{part} has been removed")
-            if os.path.lexists(path):
-                _check_replaceable(Path(target), path, replace, marker_file)
-                shutil.rmtree(path)
-            part.rename(path)
-            _sync_folder(path.parent)
-        finally:
-            if _is_at(part, descriptor):
-                shutil.rmtree(part, ignore_errors=True)
-            os.close(descriptor)
-    except OSError as problem:
-        raise OutputError(f"cannot write {target}: {problem.strerror or problem}") from problem
-
-
-def _check_replaceable(target: Path, path: Path, replace: bool, marker_file: str) -> None:
-    if not path.is_dir():
-        raise OutputError(f"{target} already exists and is not a folder")
-    if not replace:
-        raise OutputError(f"{target} already exists; --force replaces it")
-    if any(path.iterdir()) and not (path / marker_file).exists():
-        raise OutputError(f"{target} is a folder with other contents; it is left unchanged")
-
-
-def _open_folder(part: Path) -> int:
-    while True:
-        part.mkdir(exist_ok=True)
-        with contextlib.suppress(FileNotFoundError):  # another process has just removed or moved it
-            return os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
-
-
 def lock_file(descriptor: int, wait: bool = False) -> None:
     """Lock an open file or folder until it is closed; without effect on a file system without locks.
 
@@ -220,37 +169,6 @@ def lock_file(descriptor: int, wait: bool = False) -> None:
             raise
 
 
-def _locked(name: Path, open_it: Callable[[], int]) -> int:
-    """Return the locked descriptor of the file or folder `name`; BlockingIOError if another process has locked it."""
-    while True:
-        descriptor = open_it()
-        try:
-            lock_file(descriptor)
-            if _is_at(name, descriptor):
-                return descriptor
-        except BlockingIOError:
-            os.close(descriptor)
-            raise BlockingIOError(errno.EAGAIN, "another process is writing it") from None
-        except BaseException:
-            os.close(descriptor)
-            raise
-        os.close(descriptor)  # its owner has just moved or removed it: try again
-
-
-def _is_at(name: Path, descriptor: int) -> bool:
-    try:
-        return os.path.samestat(name.lstat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink()
-
-
 def check_target(target: str | Path, replace: bool) -> None:
     """Raise OutputError if `new_file` would refuse an output: to be called before a long computation."""
     AtomicOutput(target, replace).close()
@@ -258,21 +176,9 @@ def check_target(target: str | Path, replace: bool) -> None:
 
 def write_files(contents: Mapping[Path, bytes], replace: bool) -> None:
     """Write several files, of which none appears before all have been written. Raises OutputError."""
-    with contextlib.ExitStack() as closing:
-        parts = []
+    with contextlib.ExitStack() as parts:
         for target, data in contents.items():
-            part = AtomicOutput(target, replace)
-            closing.callback(part.close)
-            parts.append(part)
-            try:
-                _write(part.begin(), data)
-            except OSError as problem:
-                raise part.error(problem) from problem
-        for part in parts:
-            try:
-                part.complete()
-            except OSError as problem:
-                raise part.error(problem) from problem
+            _write(parts.enter_context(new_file(target, replace)), data)
 
 
 def write_whole(target: str | Path, data: bytes, mode: int | None = None) -> None:
@@ -293,8 +199,13 @@ def _write(descriptor: int, data: bytes) -> None:
 
 
 def _checked_target(target: Path, replace: bool) -> Path:
-    """Return the real path of the output; OutputError if it exists or cannot be written."""
-    path = _real(target)
+    """Return the absolute path of the output with links followed; OutputError if it exists or cannot be written."""
+    try:
+        path = Path(os.path.realpath(target))
+    except FileNotFoundError:
+        raise OutputError(f"cannot write {target}: the current directory has been deleted; change to another") from None
+    except (OSError, ValueError) as problem:
+        raise OutputError(f"cannot write {target}: {getattr(problem, 'strerror', None) or problem}") from None
     try:
         found = path.lstat()
     except FileNotFoundError:
@@ -309,16 +220,6 @@ def _checked_target(target: Path, replace: bool) -> Path:
     if not replace:
         raise OutputError(f"{target} already exists; --force replaces it")
     return path
-
-
-def _real(target: str | Path) -> Path:
-    """Return the absolute path of the output with links followed; OutputError if it cannot be determined."""
-    try:
-        return Path(os.path.realpath(target))
-    except FileNotFoundError:
-        raise OutputError(f"cannot write {target}: the current directory has been deleted; change to another") from None
-    except (OSError, ValueError) as problem:
-        raise OutputError(f"cannot write {target}: {getattr(problem, 'strerror', None) or problem}") from None
 
 
 def sync_tree(folder: Path) -> None:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Iterable
+from pathlib import Path
 
 from rosafe.dsp.framing import FramedStage
 from rosafe.dsp.stage import Stage
 
 MAX_BYTES = 2**30  # of a port, of a processor's history, of its state, of the samples that it keeps for a frame
 MAX_MEMORY_FRACTION = 0.5  # of the machine's memory, for ports, histories and states of all processors together
+_MEMINFO = Path("/proc/meminfo")
 
 Rows = tuple[int, ...]  # leading shape of blocks
 
@@ -18,6 +21,15 @@ Rows = tuple[int, ...]  # leading shape of blocks
 def machine_memory() -> int:
     """Return the size of this machine's memory in bytes."""
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def available_memory() -> int:
+    """Return the bytes that are free for this process, or those of the machine if /proc does not report them."""
+    try:
+        found = re.search(r"^MemAvailable: +(\d+) kB", _MEMINFO.read_text(), re.MULTILINE)
+    except OSError:  # a chroot without /proc, or another system
+        found = None
+    return min(machine_memory(), int(found[1]) * 1024) if found else machine_memory()
 
 
 def size(rows: Rows, frames: float) -> float:
@@ -44,6 +56,11 @@ def check_memory(name: str, limit: float, taken: float, advice: str, whose: str 
         expected, got = (f"{n / 2**20:.{0 if n >= 2**20 else 2}f} MiB" for n in (limit, taken))
         whose, content = whose and f" ({whose})", content and f" for {content}"
         raise ValueError(f"{name}: expected at most {expected}{whose}, got {got}{content}; {advice}")
+
+
+def refuse_over_available(size: float, name: str, advice: str) -> None:
+    """Raise ValueError, with `advice`, if `size` bytes are more than available: the system would end the process."""
+    check_memory(name, available_memory(), size, advice, "free on this machine")
 
 
 def check_stage(stage: Stage, rows: Rows, seconds: float) -> None:

@@ -7,8 +7,10 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import scipy.io
 import soundfile
 
+from rosafe.results.readers import READERS, load
 from tests import fork_server
 from tests.harness import PYTHON, SCRIPTS, Process, can_fork
 
@@ -76,3 +78,12 @@ def refused(done: subprocess.CompletedProcess[str], *words: str, code: int = 1) 
     assert done.stderr.startswith("rosafe"), done.stderr
     for word in words:
         assert word in done.stderr, done.stderr
+
+
+def ild_in(path: Path) -> np.ndarray:
+    """Return the ILD of a result of any format."""
+    if path.suffix in READERS:
+        return np.asarray(load(path)["ild"])
+    if path.suffix == ".mat":
+        return np.asarray(scipy.io.loadmat(path)["ild"])
+    return np.loadtxt(path, delimiter=",", skiprows=2, ndmin=2)[:, 1:].T

@@ -14,12 +14,11 @@ from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from typing import Any
 
-import h5py  # noqa: F401  # writers import these two in each child otherwise
+import h5py  # noqa: F401  # the writer imports it in each child otherwise
 import numpy as np
-import zarr  # noqa: F401
 
 from rosafe.processing.files import process_file
-from rosafe.results import streaming_formats
+from rosafe.results import writers
 from rosafe.results.result_metadata import Contents
 from rosafe.system.output import OutputError, new_file
 from tests.commands.command import SMALL_PARAMETERS
@@ -91,7 +90,7 @@ def _write_result(path: Path, writer_name: str, fail_at: float) -> int:
         {"ild": (31, 2000)}, {"ild": ("channel", "time")}, {"ild": "dB"}, {}, {"parameters": {"x": "y" * 30000}}
     )
     path.write_bytes(b"")
-    writer = getattr(streaming_formats, writer_name)(path, contents)
+    writer = getattr(writers, writer_name)(path, contents)
     try:
         for _ in range(4):
             writer.append("ild", np.zeros((31, 500)))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.commands.command import ROSAFE, SMALL, environment, noise, refused, rosafe, write
+from tests.commands.command import SMALL, noise, refused, rosafe, write
 
 
 @pytest.fixture
@@ -31,7 +30,6 @@ def assert_untouched(folder: Path, *others: str) -> None:
     [
         (b"", ["bad.wav: expected a sound file, got an empty file"]),
         (b"no sound at all " * 50, ["bad.wav: expected a sound file, got another file: "]),
-        (b"RIFF\xff\xff\xff\xffWAVE", ["bad.wav: expected a chunk of sound, got none"]),
     ],
 )
 def test_other_files_than_sounds(folder: Path, content: bytes, words: list[str]) -> None:
@@ -40,7 +38,7 @@ def test_other_files_than_sounds(folder: Path, content: bytes, words: list[str])
     assert_untouched(folder, "bad.wav")
 
 
-@pytest.mark.parametrize("channels", [1, 3, 8])
+@pytest.mark.parametrize("channels", [1, 3])
 def test_other_than_two_channels(folder: Path, channels: int) -> None:
     write(folder / "bad.wav", np.zeros((channels, 500)))
     refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav", "two channels, left and right ear")
@@ -87,21 +85,12 @@ def test_missing_folder_and_unreadable(folder: Path) -> None:
     [
         ("fb_nChanels=64", ["parameters: expected a known parameter, got 'fb_nChanels'", "fb_nChannels"]),
         ("fb_nChannels=", ["fb_nChannels", "whole number"]),
-        ("fb_nChannels=-3", ["fb_nChannels"]),
-        ("fb_nChannels=2.5", ["fb_nChannels", "whole number"]),
-        ("fb_nChannels=99999", ["fb_nChannels", "1024"]),
-        ("fb_lowFreqHz=nan", ["fb_lowFreqHz", "number"]),
-        ("fb_lowFreqHz=0", ["fb_lowFreqHz: expected a number above 0"]),
         ("fb_highFreqHz=9000", ["fb_highFreqHz", "half the sample rate"]),  # the file is at 16 kHz
-        ("fb_highFreqHz=50", ["fb_highFreqHz"]),  # below fb_lowFreqHz
         ("fb_cfHz=100,abc", ["fb_cfHz", "abc"]),
-        ("ihc_method=meddis", ["ihc_method", "one of none, halfwave"]),
-        ("pp_bRemoveDC=maybe", ["pp_bRemoveDC", "boolean"]),
-        ("ild_wSizeSec=0.00001", ["ild_wSizeSec"]),
-        ("ild_wSizeSec=1e9", ["ild_wSizeSec"]),
     ],
 )
 def test_parameters(folder: Path, setting: str, words: list[str]) -> None:
+    """The checks of `rosafe.process`, which has tests of all of them, apply to texts."""
     refused(rosafe("process", "in.wav", "--set", setting, cwd=folder), *words)
     assert_untouched(folder)
 
@@ -112,7 +101,7 @@ def test_a_parameter_given_twice(folder: Path) -> None:
     assert_untouched(folder)
 
 
-@pytest.mark.parametrize("outputs", ["ild,rms", "", "ILD", "ild,,ratemap"])
+@pytest.mark.parametrize("outputs", ["ild,rms", ""])
 def test_outputs(folder: Path, outputs: str) -> None:
     refused(rosafe("process", "in.wav", "--outputs", outputs, cwd=folder), "outputs: expected a known output, got ")
     assert_untouched(folder)
@@ -123,19 +112,13 @@ def test_outputs(folder: Path, outputs: str) -> None:
     [
         [],
         ["--block", "0", "in.wav"],
-        ["--block", "1e3", "in.wav"],
-        ["--block", "10000001", "in.wav"],
         ["--jobs", "0", "in.wav"],
-        ["--jobs", "-1", "in.wav"],
         ["in.wav", "--set"],
         ["in.wav", "--set", "fb_nChannels"],
         ["in.wav", "--nonsense"],
-        ["in.wav", "--out"],
-        ["in.wav", "--output", "x.npz"],
         ["in.wav", "--resume", "--force"],
         ["in.wav", "--format", "txt"],
         ["in.wav", "-o", "x.h5", "--format", "npz"],
-        ["in.wav", "--channels", "1"],
         ["in.wav", "--channels", "0,1"],
         ["in.wav", "--dask", "http://x"],
     ],
@@ -161,13 +144,6 @@ def test_output_beside_the_input_is_not_replaced_unless_forced(folder: Path) -> 
     assert_untouched(folder, "in.npz", "results")
 
 
-def test_a_failure_leaves_the_old_output(folder: Path) -> None:
-    (folder / "out.npz").write_text("precious")
-    refused(rosafe("process", "in.wav", "-o", "out.npz", "--set", "fb_highFreqHz=9000", cwd=folder), "fb_highFreqHz")
-    assert (folder / "out.npz").read_text() == "precious"
-    assert_untouched(folder, "out.npz")
-
-
 def test_unwritable_outputs(folder: Path) -> None:
     content = (folder / "in.wav").read_bytes()
     (folder / "link.npz").symlink_to("in.wav")
@@ -175,7 +151,8 @@ def test_unwritable_outputs(folder: Path) -> None:
         "nowhere/out.npz": ["nowhere/out.npz", "does not exist"],
         "in.wav/": ["-o in.wav: ", "File exists"],
         "in.wav/deep/": ["-o in.wav/deep: ", "Not a directory"],
-        "results": ["-o: expected a name ending in .npz, .h5, .mat, .zarr, .csv", "/"],
+        "results": ["-o: expected a name ending in .npz, .h5, .mat, .csv", "/"],
+        "out.zarr": ["-o: expected a name ending in .npz", "; rosafe.load(RESULT).to_xarray().to_zarr(PATH) writes"],
         "out.wav": ["-o: expected a name ending in .npz"],
         "in.wav/out.npz": ["in.wav/out.npz", "Not a directory"],
         "in.wav": ["-o: expected a name ending in .npz"],
@@ -224,21 +201,6 @@ def test_blocks_that_exceed_the_memory(folder: Path, settings: list[str]) -> Non
         "process", "in.wav", "--block", "10000000", "--outputs", "crossCorrelation", "--set", *settings, cwd=folder
     )
     refused(done, "in.wav: ", ": expected at most 1024 MiB", "MiB for one block", "--block")
-    assert_untouched(folder)
-
-
-def test_full_disk(folder: Path) -> None:
-    """A limit on the file size simulates a disk that becomes full during processing."""
-    done = subprocess.run(
-        ["/bin/bash", "-c", f"ulimit -f 100; exec {ROSAFE} process in.wav"],
-        cwd=folder,
-        env=environment(),
-        text=True,
-        capture_output=True,
-        timeout=120,
-        check=False,
-    )
-    refused(done, "in.npz", "File too large")
     assert_untouched(folder)
 
 

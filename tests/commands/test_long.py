@@ -14,7 +14,7 @@ import soundfile
 
 from rosafe import load, process
 from tests.commands.command import ROSAFE, environment, noise, rosafe, start, write
-from tests.harness import ROOT, freeze, proc, wait_for
+from tests.harness import ROOT, proc, wait_for
 from tests.terminal import Terminal
 
 pytestmark = pytest.mark.long
@@ -163,20 +163,6 @@ def test_a_killed_child_is_reported(long_file: Path) -> None:
         assert command.wait() == 1
         assert command.err == "rosafe process: in.wav: the process ended too early, with signal 9\n"
     assert not (here / "in.npz").exists()
-
-
-def test_two_commands_for_one_output(long_file: Path) -> None:
-    here, part = long_file.parent, long_file.with_name("in.npz.part")
-    with start("process", "in.wav", "--outputs", "ild", cwd=here) as command:
-        wait_for(begun(part), what=lambda: str(command))
-        (child,) = _children(command.pid)
-        freeze(child)  # it has opened the file and leaves the processor to others
-        done = rosafe("process", "in.wav", "--outputs", "ild", cwd=here)
-        os.kill(child, signal.SIGCONT)
-        assert done.returncode == 1
-        assert done.stderr == "rosafe process: in.wav: cannot write in.npz: another process is writing it\n"
-        assert command.alive and part.exists()
-        command.stop(signal.SIGINT)
 
 
 def _children(pid: int) -> list[int]:

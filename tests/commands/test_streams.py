@@ -62,7 +62,7 @@ def test_input_that_is_closed(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (1, "rosafe setup: -: Bad file descriptor\n")
 
 
-@pytest.mark.parametrize("command", ["process in.wav -o x.zarr", "record x.wav --device scene:"])
+@pytest.mark.parametrize("command", ["process in.wav -o x.h5", "record x.wav --device scene:"])
 def test_a_current_directory_that_has_been_deleted(tmp_path: Path, command: str) -> None:
     write(tmp_path / "in.wav", noise(3000))
     (tmp_path / "gone").mkdir()

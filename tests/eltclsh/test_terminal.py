@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rosafe import __version__
-from rosafe.eltclsh.history import decode, encode
+from rosafe.eltclsh.line import decode, encode
 from tests import harness
 from tests.eltclsh.conftest import environment
 from tests.terminal import Terminal

@@ -7,11 +7,9 @@ import os
 import pwd
 import resource
 import shutil
-import struct
 import subprocess
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,6 @@ import rosafe
 from rosafe.localization import angles, cues, model_cache, results
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.noise import NoiseCalibration
-from rosafe.results import isolated
 from rosafe.ros1.localizer import noise_calibration
 from rosafe.system import trust
 from tests.harness import PYTHON, ROOT
@@ -132,7 +129,6 @@ _READERS: dict[str, Callable[[Path], object]] = {
     "yaw.csv": results.read_yaw,
     "a.h5": rosafe.load,
     "a.npz": rosafe.load,
-    "a.mat": rosafe.load,
 }
 
 
@@ -220,21 +216,6 @@ def _absurd_shape(path: Path) -> None:
             archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
 
 
-def _expanding_mat(path: Path) -> None:
-    """Write bytes that MATLAB stores for numbers of the type double, compressed."""
-    count, scale = 10**8, 8
-    data = struct.pack("<IIIIIIIi", 14, 48 + count, 6, 8, 6, 0, 5, 8) + struct.pack(
-        "<iiI4s", 1, count, 4 << 16 | 1, b"axes"
-    )
-    inner = struct.pack("<II", 14, 48 + count) + data[8:] + struct.pack("<II", 2, count)
-    pack = zlib.compressobj(1)
-    packed = b"".join(
-        [pack.compress(inner), *(pack.compress(bytes(10**6)) for _ in range(count // 10**6)), pack.flush()]
-    )
-    path.write_bytes(b"MATLAB 5.0".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 15, len(packed)) + packed)
-    assert count * scale > isolated.MAX_SIZE
-
-
 def _fill_values(path: Path) -> None:
     with h5py.File(path, "w") as file:
         file.create_dataset("ild", (31, 10**7), "f8", chunks=(31, 10**5), fillvalue=1.0)
@@ -257,7 +238,6 @@ _BOMBS: dict[str, tuple[Callable[[Path], None], str]] = {
     "long.sofa": (_long_response, "768000 Hz"),
     "inflating.head": (_inflating_model, "expected less than"),
     "inflating.npz": (_inflating_npz, "its arrays: expected less than"),
-    "expanding.mat": (_expanding_mat, "its arrays: expected less than"),
     "fill.h5": (_fill_values, "its arrays: expected less than"),
     "sparse.csv": (_sparse_csv, "sparse.csv: expected at most 64 MiB"),
     "shape.head": (_absurd_shape, "shape.head: expected a model"),

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.harness import SCRIPTS
-from tests.packaging.clone import environment, run, without_rights
+from tests.packaging.clone import environment, run
 
 TOOLS = ("bash", "cat", "chmod", "dirname", "env", "flock", "grep", "head", "id", "mkdir", "mktemp", "mv", "rm", "tail")
 OS_RELEASE = "os_release=/etc/os-release"
@@ -87,14 +87,6 @@ def test_nothing_to_do_on_this_machine(tmp_path: Path) -> None:
     for options in ("", "--tests"):
         done = run(SCRIPTS / "install", *options.split(), env=environment(PATH=f"{tmp_path}:/usr/bin:/bin"))
         assert (done.returncode, done.stdout, done.stderr) == (0, "everything is installed\n", "")
-
-
-def test_nothing_to_do_does_not_call_apt(machine: Machine) -> None:
-    machine.command("dpkg-query", ALL_INSTALLED)
-    machine.command("id", "echo 1000")
-    pypi(machine, "python", "pyalsaaudio-0.11.0")
-    assert machine.install() == (0, "everything is installed\n", "")
-    assert machine.calls_of("apt-get") == []
 
 
 def test_installs_only_what_is_missing(machine: Machine) -> None:
@@ -273,17 +265,3 @@ def test_help_of_every_script_has_an_example(name: str) -> None:
     done = run(SCRIPTS / name, "-h", env=environment())
     assert (done.returncode, done.stderr) == (0, "")
     assert "usage: " in done.stdout and "example" in done.stdout
-
-
-def test_message_for_a_user_without_root(machine: Machine) -> None:
-    machine.script.parent.chmod(0o755)
-    for folder in machine.script.parents:
-        if folder == Path("/tmp"):
-            break
-        folder.chmod(0o755)
-    machine.calls.chmod(0o666)
-    (machine.bin / "id").unlink()
-    (machine.bin / "id").symlink_to("/usr/bin/id")
-    done = run(*without_rights("/bin/bash", machine.script), env=environment(PATH=f"{machine.bin}"))
-    assert done.returncode == 1
-    assert "run this as root" in done.stderr

@@ -12,8 +12,8 @@ from tests.harness import ROOT
 PACKAGE = ROOT / "rosafe"
 # The library, lowest first: each folder may import those before it.
 LIBRARY = (
-    *("system", "declarations", "dsp", "plugin", "representations", "interface", "tree", "testing"),
-    *("audio.files", "results", "processing", "torch", "setups", "view", "localization", "audio.devices", "validation"),
+    *("system", "declarations", "dsp", "plugin", "representations", "interface", "tree", "testing", "view"),
+    *("audio.files", "results", "processing", "torch", "setups", "localization", "audio.devices", "validation"),
 )
 # A door may import the library, and each of its folders those before it.
 DOORS = {

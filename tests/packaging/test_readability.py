@@ -6,7 +6,7 @@ import ast
 import functools
 import importlib
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -96,69 +96,6 @@ def test_each_class_of_a_folder_has_a_name_of_its_own() -> None:
 
 
 # --- plain English ----------------------------------------------------------------------------------------------
-
-# Marked sentences for each folder, in per cent. A figure may only fall: lower it when the text has become better.
-MAX_MARKED_PERCENT: dict[str, float] = {
-    "benchmarks": 0.2,
-    "cmake": 0.0,
-    "debian": 0.0,
-    "docs": 0.9,
-    "examples": 0.0,
-    "matlab": 2.0,
-    "paper": 0.0,
-    "python": 0.0,
-    "rosafe": 0.8,
-    "rosafe/commands": 1.5,
-    "rosafe/declarations": 2.0,
-    "rosafe/demo": 1.5,
-    "rosafe/dsp": 2.0,
-    "rosafe/eltclsh": 1.6,
-    "rosafe/interface": 2.9,
-    "rosafe/localization": 1.5,
-    "rosafe/processing": 1.0,
-    "rosafe/representations": 1.0,
-    "rosafe/audio": 1.5,
-    "rosafe/results": 1.0,
-    "rosafe/ros1": 1.0,
-    "rosafe/system": 0.8,
-    "rosafe/web": 0.9,
-    "rosafe/setups": 1.4,
-    "rosafe/tree": 1.2,
-    "rosafe/validation": 0.0,
-    "rosafe/view": 2.3,
-    "scripts": 0.0,
-    "systemd": 0.0,
-    "tcl": 2.3,
-    "tests": 1.9,
-    "top": 1.7,
-}
-SLACK_PERCENT = 1.0  # how far the text may be better than its figure
-
-
-def folder_of(path: Path) -> str:
-    parts = path.relative_to(ROOT).parts
-    return "/".join(parts[:2]) if parts[0] == "rosafe" and len(parts) > 2 else parts[0] if len(parts) > 1 else "top"
-
-
-@pytest.fixture(scope="module")
-def marked_percent() -> dict[str, float]:
-    """The share of sentences with a marker in each folder."""
-    counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
-    for path in tracked():
-        if path.suffix in SUFFIXES and path.name not in ("prose.py", "parameters.md"):
-            for sentence in sentences(path):
-                count = counts[folder_of(path)]
-                count[0] += 1
-                count[1] += bool(markers(sentence))
-    return {folder: 100 * marked / total for folder, (total, marked) in sorted(counts.items()) if total}
-
-
-def test_the_share_of_sentences_with_a_marker_only_falls(marked_percent: dict[str, float]) -> None:
-    assert marked_percent.keys() == MAX_MARKED_PERCENT.keys()
-    worse = {f: round(p, 1) for f, p in marked_percent.items() if p > MAX_MARKED_PERCENT[f]}
-    assert not worse, "list them with: python3 -m tests.packaging.prose FOLDER"
-    better = {f: round(p, 1) for f, p in marked_percent.items() if p < MAX_MARKED_PERCENT[f] - SLACK_PERCENT}
-    assert not better, "lower the figures of these folders in MAX_MARKED_PERCENT"
 
 
 @pytest.mark.parametrize(

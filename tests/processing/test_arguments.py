@@ -16,7 +16,6 @@ import pytest
 import rosafe
 from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.processing import process as offline
-from rosafe.results import memory
 from rosafe.tree import sizes
 
 GOOD = np.zeros((2, 100))
@@ -273,13 +272,11 @@ def test_tracebacks_end_at_the_call() -> None:
         assert raised.value.__suppress_context__
 
 
-def test_positional_options_are_deprecated() -> None:
+def test_options_are_given_by_name() -> None:
     kinds = [p.kind.name for p in inspect.signature(rosafe.process).parameters.values()]
     assert kinds == ["POSITIONAL_OR_KEYWORD"] * 2 + ["KEYWORD_ONLY"] * 6
-    with pytest.warns(DeprecationWarning, match="by name"), pytest.raises(ValueError, match="fb_nERBs"):
-        rosafe.process(GOOD, RATE, {"fb_nERBs": 0})
-    with pytest.raises(TypeError, match="expected 2 positional arguments, got 7"):
-        rosafe.process(GOOD, RATE, {}, 1, (), None, 5)
+    with pytest.raises(TypeError, match="takes 2 positional arguments but 3 were given"):
+        rosafe.process(GOOD, RATE, {"fb_nERBs": 0})  # type: ignore[call-arg]
 
 
 def test_sizes_beyond_the_memory() -> None:
@@ -292,13 +289,13 @@ def test_results_larger_than_the_free_memory(monkeypatch: pytest.MonkeyPatch, tm
     """If other processes use the memory, the kernel would end this process."""
     meminfo = tmp_path / "meminfo"
     meminfo.write_text("MemTotal:       24684196 kB\nMemFree: 1 kB\nMemAvailable:      12000 kB\n")
-    monkeypatch.setattr(memory, "_MEMINFO", meminfo)
+    monkeypatch.setattr(sizes, "_MEMINFO", meminfo)
     sound, large = np.zeros((2, 4000)), {"cc_maxDelaySec": 1.0}
     refused(r"outputs: expected at most 12 MiB \(free on this machine\), got", sound, RATE, parameters=large)
     with pytest.raises(ValueError, match=r"^block: expected at most 12 MiB \(free on this machine\), got .*; process"):
         rosafe.Stream(RATE, large).process(sound)
     meminfo.unlink()  # the free memory is unknown
-    assert memory.available() == sizes.machine_memory()
+    assert sizes.available_memory() == sizes.machine_memory()
 
 
 def test_large_files_are_refused_without_reading_them(tmp_path: Path) -> None:

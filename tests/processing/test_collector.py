@@ -9,9 +9,9 @@ import pytest
 
 import rosafe
 from rosafe.dsp import kernels
+from rosafe.processing.collector import OutputCollector
 from rosafe.representations import STAGES
 from rosafe.representations.haircell import METHODS, InnerHairCell
-from rosafe.results.collector import OutputCollector
 from tests.dsp.bare import Chain, cut
 
 pytestmark = [

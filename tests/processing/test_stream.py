@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import rosafe
 from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.representations import STAGES
-from rosafe.results import memory
+from rosafe.tree import sizes
 from tests.representations.chain import Chain, cut
 
 RATE = 16000
@@ -150,7 +150,7 @@ def test_a_refused_first_block_changes_nothing(bad: np.ndarray, monkeypatch: pyt
     """The stream does not remember its number of ears, number type or orientation."""
     stream = rosafe.Stream(RATE, FEW)
     with monkeypatch.context() as patch:
-        patch.setattr(memory, "available", lambda: 10**5)  # bytes: too few for 2000 samples
+        patch.setattr(sizes, "available_memory", lambda: 10**5)  # bytes: too few for 2000 samples
         with pytest.raises(ValueError, match=r"NaN|^block: expected at most 0\.10 MiB"):
             stream.process(bad)
     pair = np.array([[1.0, 2.0], [3.0, 4.0]])  # read as (2, N), which a first block of (N, 2) would change
