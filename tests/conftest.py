@@ -28,7 +28,7 @@ STARTING_FILES = (  # the same for single files
     "ros1/bass/test_record.py",
     "eltclsh/test_script.py",
     "eltclsh/test_terminal.py",
-    "web/genomix/test_decode.py",
+    "web/genomix/test_packed.py",
     "web/genomix/test_front_end.py",
     "ros1/localizer/test_recovery.py",
     "results/test_damaged.py",

@@ -43,7 +43,6 @@ LIMITS = Limits(
     max_header_bytes=16 * 2**20,
     max_answers=512 * 2**20,
     request_seconds=15.0,
-    idle_seconds=3600.0,
 )
 
 log = logging.getLogger("genomixd")
@@ -143,6 +142,8 @@ class HttpApi:
         try:
             await self._check_host(request)
             check_no_browser(request.headers)
+            if request.method == "GET" and request.body_exists:
+                raise HttpRefusal(400, "expected a GET request without a body")
             _check_url(request)
             if not _is_packed(request):
                 _syntax(request)
@@ -151,7 +152,7 @@ class HttpApi:
                 session.busy += 1
             return await handler(request)
         except HttpRefusal as refusal:
-            answer = _error(request, _refusal_error(refusal))
+            answer = _error(request, _refusal_error(refusal), refusal.status)
             if refusal.status == HTTPStatus.FORBIDDEN:
                 answer.set_status(refusal.status)  # also of a packed answer: clients use the status
             answer.force_close()
@@ -311,7 +312,7 @@ class HttpApi:
         pieces = _encoded(request, value)
         if value.size <= BATCH // 8:
             return _respond(request, b"".join(pieces))
-        with self._connections.reading_answer(connection_of(request), value.data, value.size):
+        with self._connections.reading_answer(value.data, value.size):
             return await self._stream_pieces(request, pieces)
 
     async def _stream_pieces(self, request: web.Request, pieces: Iterator[bytes]) -> web.StreamResponse:
