@@ -29,7 +29,6 @@ STARTING_FILES = (  # the same for single files
     "eltclsh/test_script.py",
     "eltclsh/test_terminal.py",
     "web/genomix/test_packed.py",
-    "web/genomix/test_front_end.py",
     "ros1/localizer/test_recovery.py",
     "results/test_damaged.py",
     "processing/test_examples.py",

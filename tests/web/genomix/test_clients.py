@@ -314,7 +314,10 @@ def test_unpaired_surrogates_are_rejected_everywhere(world: World) -> None:
     half, bad = quote('"\\ud800"'), "%ED%A0%80"
     name, device = quote('"nameProc"'), quote('"device"')
     urls = [
-        *(f"/call/rosAFE/getDependencies?input={given}" for given in (f"[{half}]", f"{{{name}:{half}}}", "[%22\xff%22]")),
+        *(
+            f"/call/rosAFE/getDependencies?input={given}"
+            for given in (f"[{half}]", f"{{{name}:{half}}}", "[%22\xff%22]")
+        ),
         f"/call/rosAFE/request?input=[{half}]",
         f"/call/bass/Acquire?input={{{device}:{half}}}",
         f"/send/bass/Acquire?argv=[{half}]&oneway=1",
@@ -366,9 +369,7 @@ paths = st.one_of(
 )
 values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | texts,
-    lambda inner: (
-        st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(parameters) | texts, inner, max_size=4)
-    ),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(parameters) | texts, inner, max_size=4),
     max_leaves=8,
 )
 keys = st.sampled_from(["s", "syntax", "input", "argv", "id", "ack", "oneway", "element", "i", "as", "ms", "dir"])

@@ -176,7 +176,9 @@ def test_the_server_answers_packed(world: World) -> None:
     about = get("/load/rosAFE?syntax=packed&s=p")
     wanted = world.http.get("/load/rosAFE")
     assert list(about["services"]) == list(wanted["services"]) and about["doc"] == wanted["doc"]
-    with pytest.raises(genomix.GenoMError, match="::rosAFE::e_noSuchProcessor: there is no processor 'x'; there are: none"):
+    with pytest.raises(
+        genomix.GenoMError, match="::rosAFE::e_noSuchProcessor: there is no processor 'x'; there are: none"
+    ):
         get("/call/rosAFE/removeProcessor?syntax=packed&input=[%22x%22]")
     with pytest.raises(genomix.GenoMError, match="::genomix::e_url"):
         get("/nowhere?syntax=packed")
@@ -201,7 +203,14 @@ def signal(*levels: tuple[str, int], data: bytes = b"") -> bytes:
 def documents() -> list[bytes]:
     """Answers of all kinds."""
     lags = [[np.arange(3.0) + 10 * channel for channel in range(2)] for _ in range(4)]
-    port = {"sampleRate": 1, "lastFrameIndex": 2, "framesOnPort": 3, "numberOfChannels": 2, "left": lags[0], "right": []}
+    port = {
+        "sampleRate": 1,
+        "lastFrameIndex": 2,
+        "framesOnPort": 3,
+        "numberOfChannels": 2,
+        "left": lags[0],
+        "right": [],
+    }
     return [
         binary_format.plain(
             {"a": [1, 2.5], "b": ["x", "ä€", ""], "c": [], "d": {"::e": True}, "e": {"f": {"g": None}}}

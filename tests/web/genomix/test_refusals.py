@@ -110,7 +110,9 @@ REFUSALS = (
         "/no/such.wav: No such file or directory",
         ("record", "--device", "file:/no/such.wav"),
     ),
-    Refusal("bass/Acquire", {"device": "hw:1,0'; rm"}, "e_device", "hw:1,0'; rm", ("record", "--device", "hw:1,0'; rm")),
+    Refusal(
+        "bass/Acquire", {"device": "hw:1,0'; rm"}, "e_device", "hw:1,0'; rm", ("record", "--device", "hw:1,0'; rm")
+    ),
 )
 NUMBERED = [pytest.param(k, id=f"{k + 1}-{r.request.partition('/')[2]}") for k, r in enumerate(REFUSALS)]
 WITH_COMMAND = [k for k, refusal in enumerate(REFUSALS) if refusal.command]
