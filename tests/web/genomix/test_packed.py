@@ -1,4 +1,4 @@
-"""The packed format: decoded values are equal to the encoded ones, in Python and in Octave, and invalid data are errors.
+"""The packed format: decoded values are those that were encoded, in Python and Octave, and invalid data are errors.
 
 Octave reports each invalid answer immediately, whatever sizes it contains.
 """

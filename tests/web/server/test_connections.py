@@ -298,9 +298,9 @@ def test_answers_that_clients_read_slowly_leave_no_memory_for_others() -> None:
 def test_a_single_answer_may_be_too_large() -> None:
     every = Connections(replace(LIMITS, max_answers=100), _format, logging.getLogger())
     samples = object(), object()
-    with every.reading_answer(samples[0], 1000), every.reading_answer(samples[0], 1000):
-        with pytest.raises(HttpRefusal, match="clients are reading"), every.reading_answer(samples[1], 1):
-            pass
+    one, same = (every.reading_answer(samples[0], 1000) for _ in range(2))
+    with one, same, pytest.raises(HttpRefusal, match="clients are reading"), every.reading_answer(samples[1], 1):
+        pass
     with every.reading_answer(samples[0], 60), every.reading_answer(samples[1], 40):
         pass
 
