@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import pytest
+import yaml
 
 from tests import harness
 from tests.matlab import octave
@@ -114,8 +115,7 @@ REFUSALS = (
         "bass/Acquire", {"device": "hw:1,0'; rm"}, "e_device", "hw:1,0'; rm", ("record", "--device", "hw:1,0'; rm")
     ),
 )
-NUMBERED = [pytest.param(k, id=f"{k + 1}-{r.request.partition('/')[2]}") for k, r in enumerate(REFUSALS)]
-WITH_COMMAND = [k for k, refusal in enumerate(REFUSALS) if refusal.command]
+WITH_COMMAND = [refusal for refusal in REFUSALS if refusal.command]
 
 # Run `rosservice call NAME YAML` and `rosafe WORD ...` in one process, because starting Python is slow.
 ROSSERVICE = """
@@ -137,7 +137,7 @@ for words in json.load(sys.stdin):
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+def refusing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     """A tree of four processors, and a second rosAFE without any."""
     with worlds.world(tmp_path_factory.mktemp("world")) as world, world.graph.node("rosAFE-ros", "-i", "empty"):
         world.http.call("bass/Acquire", ["scene:"])
@@ -147,14 +147,19 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
         yield world
 
 
-def full(refusal: Refusal) -> str:
-    """Return the complete name of the exception."""
-    return refusal.ex if refusal.ex.startswith("::") else f"::{refusal.request.partition('/')[0]}::{refusal.ex}"
+@pytest.fixture
+def world(refusing: World) -> Iterator[World]:
+    """The same; nothing has changed after a test."""
+    yield refusing
+    processors = refusing.http.call("rosAFE/getProcessors")["processors"]
+    assert [p["name"] for p in processors] == ["input", "preProc", "gammatone", "ihc"]
+    assert refusing.http.call("empty/getProcessors")["processors"] == []
 
 
 def check(refusal: Refusal, body: dict[str, Any]) -> None:
     """Check that a client got the expected exception, with its reason in one of two places."""
-    assert body["ex"] == full(refusal), body
+    ex = refusal.ex if refusal.ex.startswith("::") else f"::{refusal.request.partition('/')[0]}::{refusal.ex}"
+    assert body["ex"] == ex, body
     places = [body["what"]] if "what" in body else []
     places += [body["detail"]["what"]] if "what" in body.get("detail", {}) else []
     assert len(places) == 1 and refusal.why in places[0] and "\n" not in places[0], body
@@ -166,39 +171,27 @@ def program(world: World, text: str, given: Any) -> Any:
     return world.graph.run("python3", "-c", text, stdin=json.dumps(given), timeout=180, PYTHONPATH=python)
 
 
-@pytest.fixture(scope="module")
-def by_rosservice(world: World) -> list[str]:
+def test_rosservice(world: World) -> None:
     calls = [(f"/{r.request}", json.dumps(r.given)) for r in REFUSALS]
-    return str(program(world, ROSSERVICE, calls).stdout).split("%%\n")
+    for refusal, printed in zip(REFUSALS, program(world, ROSSERVICE, calls).stdout.split("%%\n"), strict=False):
+        answer = yaml.safe_load(printed)
+        assert answer["genom_success"] is False
+        check(refusal, json.loads(answer["genom_exdetail"]))
 
 
-@pytest.mark.parametrize("number", NUMBERED)
-def test_rosservice(by_rosservice: list[str], number: int) -> None:
-    import yaml
-
-    answer = yaml.safe_load(by_rosservice[number])
-    assert answer["genom_success"] is False
-    check(REFUSALS[number], json.loads(answer["genom_exdetail"]))
-
-
-@pytest.mark.parametrize("number", NUMBERED)
-def test_http(world: World, number: int) -> None:
-    refusal = REFUSALS[number]
-    with pytest.raises(worlds.HttpError) as refused:
-        world.http.call(refusal.request, refusal.given)
-    assert refused.value.status in (404, 422)
-    check(refusal, refused.value.body)
+def test_http(world: World) -> None:
+    for refusal in REFUSALS:
+        with pytest.raises(worlds.HttpError) as refused:
+            world.http.call(refusal.request, refusal.given)
+        assert refused.value.status in (404, 422)
+        check(refusal, refused.value.body)
 
 
-@pytest.fixture(scope="module")
-def by_tcl(world: World) -> list[list[str]]:
+def test_tcl(world: World) -> None:
     words = []
     for refusal in REFUSALS:
-        given = " ".join(
-            "{%s}" % (" ".join(map(str, v)) if isinstance(v, list) else v)
-            for pair in refusal.given.items()
-            for v in pair
-        )
+        pairs = [value for pair in refusal.given.items() for value in pair]
+        given = " ".join("{%s}" % (" ".join(map(str, v)) if isinstance(v, list) else v) for v in pairs)
         words.append(f"tell {{{refusal.request.replace('/', '::')} {{{given}}}}}")
     script = """
         set g [genomix::connect $address]
@@ -211,27 +204,20 @@ def by_tcl(world: World) -> list[list[str]]:
             puts [dict get $message ex]\\t$what\\t[lrange [dict get $options -errorcode] 0 1]
         }
     """
-    return [line.split("\t") for line in world.lines(script + "\n".join(words))]
+    for refusal, line in zip(REFUSALS, world.lines(script + "\n".join(words)), strict=True):
+        ex, what, code = line.split("\t")
+        check(refusal, {"ex": ex, "what": what})
+        assert code == f"GENOM {ex}"
 
 
-@pytest.mark.parametrize("number", NUMBERED)
-def test_tcl(by_tcl: list[list[str]], number: int) -> None:
-    ex, what, code = by_tcl[number]
-    check(REFUSALS[number], {"ex": ex, "what": what})
-    assert code == f"GENOM {ex}"
-
-
-@pytest.fixture(scope="module")
-def by_octave(world: World) -> dict[str, Any]:
-    lines = []
+def test_octave(world: World) -> None:
+    lines = ["client = genomix.client(); bass = client.load('bass'); rosAFE = client.load('rosAFE');"]
     for number, refusal in enumerate(REFUSALS):
         fields = ", ".join(f"'{name}', {_matlab(value)}" for name, value in refusal.given.items())
-        component, request = refusal.request.split("/")
-        lines.append(f"show('r{number}', {component}.{request}(struct({fields})).exception);")
-    return octave.run_and_parse(
-        world,
-        "client = genomix.client(); bass = client.load('bass'); rosAFE = client.load('rosAFE');\n" + "\n".join(lines),
-    )
+        lines.append(f"show('r{number}', {refusal.request.replace('/', '.')}(struct({fields})).exception);")
+    shown = octave.run_and_parse(world, "\n".join(lines))
+    for number, refusal in enumerate(REFUSALS):
+        check(refusal, shown[f"r{number}"])
 
 
 def _matlab(value: Any) -> str:
@@ -240,26 +226,10 @@ def _matlab(value: Any) -> str:
     return f"{{{{{', '.join(map(str, value))}}}}}" if isinstance(value, list) else str(value)
 
 
-@pytest.mark.parametrize("number", NUMBERED)
-def test_octave(by_octave: dict[str, Any], number: int) -> None:
-    check(REFUSALS[number], by_octave[f"r{number}"])
-
-
-@pytest.fixture(scope="module")
-def by_command(world: World) -> dict[int, str]:
-    done = program(world, ROSAFE, [REFUSALS[number].command for number in WITH_COMMAND])
-    return dict(zip(WITH_COMMAND, done.stderr.split("%%\n"), strict=False))
-
-
-@pytest.mark.parametrize("number", WITH_COMMAND)
-def test_command_line(by_command: dict[int, str], number: int) -> None:
+def test_command_line(world: World) -> None:
     """In one line, with exit status 1."""
-    line, code, end = by_command[number].split("\n")
-    assert line.startswith(f"rosafe {REFUSALS[number].command[0]}: ") and REFUSALS[number].why in line
-    assert (code, end) == ("exit 1", "")
-
-
-def test_nothing_has_changed(world: World, by_rosservice: Any, by_tcl: Any, by_octave: Any, by_command: Any) -> None:
-    processors = world.http.call("rosAFE/getProcessors")["processors"]
-    assert [p["name"] for p in processors] == ["input", "preProc", "gammatone", "ihc"]
-    assert world.http.call("empty/getProcessors")["processors"] == []
+    done = program(world, ROSAFE, [refusal.command for refusal in WITH_COMMAND])
+    for refusal, printed in zip(WITH_COMMAND, done.stderr.split("%%\n"), strict=False):
+        line, code, end = printed.split("\n")
+        assert line.startswith(f"rosafe {refusal.command[0]}: ") and refusal.why in line
+        assert (code, end) == ("exit 1", "")
