@@ -65,7 +65,7 @@ class ClientAccount:
     """The connections from one address.
 
     Connections without a request in progress are `silent` (not authenticated) or `idle` (authenticated), the longest
-    silence first. `long_polls` is the number of requests whose duration the client determines.
+    silence first. `long_polls` are connections with a request whose duration the client determines.
     """
 
     def __init__(self, address: str) -> None:
@@ -73,7 +73,7 @@ class ClientAccount:
         self.connections: set[HttpConnection] = set()
         self.silent: dict[HttpConnection, None] = {}
         self.idle: dict[HttpConnection, None] = {}
-        self.long_polls = 0
+        self.long_polls: set[HttpConnection] = set()
 
 
 class Connections:
@@ -99,7 +99,7 @@ class Connections:
         self._accounts: dict[str, ClientAccount] = {}
         self._logged_at = -LOG_SECONDS
         self.long_requests: dict[HttpConnection, int] = {}  # bytes of the requests that are longer than `BUFFER`
-        self._answers: list[tuple[object, int]] = []  # answers being read, and their bytes
+        self._answers: dict[object, tuple[object, int]] = {}  # answers being read, and their bytes, by reading
 
     def admit(self, connection: HttpConnection, address: str) -> ClientAccount | None:
         """Return the account of a new connection; None if the limit is reached and no other one can be closed."""
@@ -132,6 +132,7 @@ class Connections:
         """Remove a connection that has ended."""
         account = connection.account
         self.long_requests.pop(connection, None)
+        account.long_polls.discard(connection)
         account.silent.pop(connection, None)
         account.idle.pop(connection, None)
         if connection in account.connections:
@@ -141,13 +142,14 @@ class Connections:
 
     def make_room(self, connection: HttpConnection) -> bool:
         """Close the connections that have been sending a long request for longest; return whether that suffices."""
-        limit = self.limits.max_header_bytes
-        for other in list(self.long_requests):
-            if sum(self.long_requests.values()) <= limit:
+        total = sum(self.long_requests.values())
+        for other, size in list(self.long_requests.items()):
+            if total <= self.limits.max_header_bytes:
                 break
             if other is not connection and other in other.account.silent:
                 other.drop()
-        return sum(self.long_requests.values()) <= limit
+                total -= size
+        return total <= self.limits.max_header_bytes
 
     @contextlib.contextmanager
     def long_poll(self, connection: HttpConnection) -> Iterator[None]:
@@ -158,14 +160,14 @@ class Connections:
         HttpRefusal
             If there are too many of them.
         """
-        account, limit = connection.account, self._max_per_address // 2
-        if account.long_polls >= limit:
+        polls, limit = connection.account.long_polls, self._max_per_address // 2
+        if len(polls) >= limit:
             raise HttpRefusal(503, f"{limit} requests of this address are listening or waiting")
-        account.long_polls += 1
+        polls.add(connection)
         try:
             yield
         finally:
-            account.long_polls -= 1
+            polls.discard(connection)
 
     @contextlib.contextmanager
     def reading_answer(self, data: object, size: int) -> Iterator[None]:
@@ -176,16 +178,17 @@ class Connections:
         HttpRefusal
             If there is not enough memory.
         """
-        sizes = {id(answer): answer_size for answer, answer_size in self._answers}
+        sizes = {id(answer): answer_size for answer, answer_size in self._answers.values()}
         if sizes and id(data) not in sizes and sum(sizes.values()) + size > self.limits.max_answers:
             raise HttpRefusal(
                 503, f"clients are reading {self.limits.max_answers >> 20} MiB of answers; try again later"
             )
-        self._answers.append(entry := (data, size))
+        reading = object()
+        self._answers[reading] = data, size
         try:
             yield
         finally:
-            self._answers.remove(entry)
+            del self._answers[reading]
 
 
 class HttpConnection(web.RequestHandler):

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import cast
 
+import numpy as np
 import pytest
 from aiohttp import web
 
@@ -297,7 +298,7 @@ def test_answers_that_clients_read_slowly_leave_no_memory_for_others() -> None:
 
 def test_a_single_answer_may_be_too_large() -> None:
     every = Connections(replace(LIMITS, max_answers=100), _format, logging.getLogger())
-    samples = object(), object()
+    samples = np.zeros(2), np.zeros(2)
     one, same = (every.reading_answer(samples[0], 1000) for _ in range(2))
     with one, same, pytest.raises(HttpRefusal, match="clients are reading"), every.reading_answer(samples[1], 1):
         pass
