@@ -13,7 +13,7 @@ import soundfile
 
 import rosafe
 from rosafe.commands.__main__ import main
-from rosafe.localization import training
+from rosafe.localization import recordings, training
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.results import read_recordings, read_yaw
 from tests.localization.conftest import RATE, modulated
@@ -167,5 +167,7 @@ def test_a_model_of_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert DirectionModel.load(target).sample_rate == RATE
     found = rosafe.localize(head.render(modulated(1.0, 3), RATE, 45), RATE, target)
     assert min(abs(found["azimuth"][-1] - 45), abs(found["azimuth"][-1] - 135)) <= 5
+    tables = recordings._interpolated(np.arange(24.0)[np.newaxis], np.arange(-180.0, 180.0, 15.0))
+    assert np.allclose(tables[0, :5], np.arange(1, 6) / 3)  # of -175, -170 ... -155 degrees
     table.write_text("file,azimuth_deg\n0.wav,0\n90.wav,90\n")
     assert main(["head", "learn", str(table), "-o", str(target), "--force"]) == 1

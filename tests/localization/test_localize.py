@@ -14,6 +14,7 @@ import rosafe
 from rosafe.localization import cues, model_cache, training
 from rosafe.localization.cues import KINDS
 from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.localize import clipped_samples
 from tests.localization.conftest import RATE, modulated
 
 
@@ -143,6 +144,9 @@ def test_clipping_is_one_warning(sphere_model: Path) -> None:
         found = rosafe.localize(sound, RATE, sphere_model)
     assert len(caught) == 1 and f"{np.count_nonzero(np.abs(sound) == 1)} samples are clipped" in str(caught[0].message)
     assert np.isfinite(found["azimuth"][-1])
+    single = np.zeros((2, 1000))
+    single[:, ::2] = 1.0  # peaks of a sound that reaches full scale
+    assert (clipped_samples(single), clipped_samples(np.ones((2, 3)))) == (0, 6)
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,7 @@ def test_levels_are_those_of_the_file(tmp_path: Path, signal: str) -> None:
     scene = read_scene(scene_file(tmp_path, f"sources: [{{signal: {signal}, level_db: -30}}]"))
     samples = scene.sources[0].signal.samples(1000, RATE)
     assert np.sqrt(np.mean(samples**2)) == pytest.approx(1, rel=0.02)
+    assert np.allclose(scene.sources[0].signal.samples(3000, 100), samples[2000:2100], atol=1e-9)
     assert scene.sources[0].level_db == -30
 
 
@@ -88,6 +89,8 @@ sources:
 """,
     )
     scene = read_scene(path)
+    once, loop = (source.signal.samples(4000, 6000) for source in scene.sources[:2])
+    assert np.all(loop == loop[0]) and np.array_equal(once, np.where(np.arange(6000) < 410, loop, 0.0))
     assert scene.truth(0.1).names == ("tone",)
     assert scene.truth(0.55).names == ("once", "loop", "tone")
     assert scene.truth(0.65).names == ("loop", "tone")

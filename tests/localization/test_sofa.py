@@ -16,6 +16,7 @@ from rosafe.commands.__main__ import main
 from rosafe.localization import angles, training
 from rosafe.localization.horizontal_plane import near_ear_gain
 from rosafe.localization.sofa import read_sofa
+from rosafe.ros1.localizer import node
 from rosafe.ros1.localizer import settings as node_settings
 from tests.harness import shared
 
@@ -360,3 +361,7 @@ def test_the_setting_of_the_node() -> None:
     assert node_settings.read_settings({**given, "mirror": ""}).mirror is None  # of the launch file
     with pytest.raises(ValueError, match="mirror: expected true or false, got 'no'"):
         node_settings.read_settings({**given, "mirror": "no"})
+    with pytest.raises(ValueError, match="mirror: expected a SOFA file as the head, got 'sphere'"):
+        node.Models(node_settings.LocalizerSettings(mirror=True))
+    with pytest.raises(ValueError, match="world_frame: expected another frame than head_frame, got 'head'"):
+        node_settings.read_settings({**given, "world_frame": "/head"})

@@ -7,9 +7,34 @@ from pathlib import Path
 import numpy as np
 
 import rosafe
-from rosafe.localization.mixture import Candidate
+from rosafe.localization.mixture import Candidate, candidates
 from rosafe.localization.tracker import Tracker
 from tests.localization.conftest import RATE, modulated
+
+
+def evidence(*azimuths: float) -> np.ndarray:
+    """Return evidence (100, A) for some azimuths."""
+    units = np.zeros((100, 72), np.float32)
+    units[:, [round((azimuth + 175) / 5) for azimuth in azimuths]] = 10.0
+    return units
+
+
+def test_equal_directions_are_one_candidate_in_front_of_the_head() -> None:
+    for yaw, azimuth in ((0.0, 40.0), (180.0, 140.0)):
+        (found,) = candidates(evidence(40, 140), yaw, np.full(100, 0.02))
+        assert found.azimuth == azimuth
+        assert abs(found.share - 1) < 0.1 and abs(found.power - 2) < 0.1  # those of both
+
+
+def test_a_candidate_has_the_power_of_its_units() -> None:
+    units = np.concatenate((evidence(40), evidence(-60), evidence(-60)))
+    powers = np.repeat([0.03, 0.01], [100, 200])
+    salient = np.repeat([True, False], [100, 200])
+    source, noise = candidates(units, 0.0, powers, salient)
+    assert (round(source.azimuth), round(noise.azimuth)) == (40, -60)
+    assert abs(source.power - 3) < 0.1 and abs(noise.power - 2) < 0.1
+    assert source.salience > 0.9 and noise.salience < 0.1
+    assert source.share > 0.8  # of the evidence without that of the noise
 
 
 def run(azimuths: list[list[float]], share: float = 0.5) -> Tracker:

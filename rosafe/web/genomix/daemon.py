@@ -17,8 +17,7 @@ from rosafe.ros1.transport import master, systemd
 from rosafe.system import option_types
 from rosafe.system.terminal import printable
 from rosafe.system.version import VERSION
-from rosafe.web.genomix.names import Names, parameter_name
-from rosafe.web.genomix.routes import HttpApi
+from rosafe.web.genomix.routes import HttpApi, Names, parameter_name
 from rosafe.web.genomix.sessions import Sessions
 from rosafe.web.server.access import host_name, own_names
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import re
-from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from http import HTTPStatus
 from typing import Any, TypeVar
@@ -17,14 +18,13 @@ from rosafe.interface import ComponentError
 from rosafe.ros1.client.asyncio_tools import wait_any
 from rosafe.ros1.client.component_client import Call, ComponentClient, Value
 from rosafe.ros1.client.errors import bad_value, middleware_error
+from rosafe.ros1.client.graph import Graph, NotRegisteredError
 from rosafe.ros1.client.values import parse_input
 from rosafe.system.version import VERSION
 from rosafe.web.genomix import binary_format
-from rosafe.web.genomix.activity_request import Request
-from rosafe.web.genomix.names import Names
-from rosafe.web.genomix.sessions import Session, Sessions
+from rosafe.web.genomix.sessions import Request, Session, Sessions
 from rosafe.web.genomix.text_formats import JSON, SYNTAXES, TCL, Syntax, plain, structure
-from rosafe.web.server.access import check_host, check_no_browser
+from rosafe.web.server.access import check_host, check_no_browser, host_name
 from rosafe.web.server.connections import Connections, Limits
 from rosafe.web.server.listener import HttpListener, connection_of
 from rosafe.web.server.refusal import HttpRefusal
@@ -35,6 +35,7 @@ BATCH = 128 * 1024  # characters written at a time
 REFUSAL_SECONDS = 0.05  # from the acknowledgement of a rejected request to its error
 ANSWER_SECONDS = 75.0  # for any answer except /request/wait; a component has 60 s of these
 HEARTBEAT_SECONDS = 15.0  # between two lines to an event listener
+READ_SECONDS = 1.0  # between two reads of the parameter ~names, regardless of the number of requests
 SHUTDOWN_SECONDS = 1.0  # for answers in progress at the end
 
 LIMITS = Limits(
@@ -43,7 +44,6 @@ LIMITS = Limits(
     max_header_bytes=16 * 2**20,
     max_answers=512 * 2**20,
     request_seconds=15.0,
-    idle_seconds=3600.0,
 )
 
 log = logging.getLogger("genomixd")
@@ -143,6 +143,8 @@ class HttpApi:
         try:
             await self._check_host(request)
             check_no_browser(request.headers)
+            if request.method == "GET" and request.body_exists:
+                raise HttpRefusal(400, "expected a GET request without a body")
             _check_url(request)
             if not _is_packed(request):
                 _syntax(request)
@@ -151,7 +153,7 @@ class HttpApi:
                 session.busy += 1
             return await handler(request)
         except HttpRefusal as refusal:
-            answer = _error(request, _refusal_error(refusal))
+            answer = _error(request, _refusal_error(refusal), refusal.status)
             if refusal.status == HTTPStatus.FORBIDDEN:
                 answer.set_status(refusal.status)  # also of a packed answer: clients use the status
             answer.force_close()
@@ -311,7 +313,7 @@ class HttpApi:
         pieces = _encoded(request, value)
         if value.size <= BATCH // 8:
             return _respond(request, b"".join(pieces))
-        with self._connections.reading_answer(connection_of(request), value.data, value.size):
+        with self._connections.reading_answer(value.data, value.size):
             return await self._stream_pieces(request, pieces)
 
     async def _stream_pieces(self, request: web.Request, pieces: Iterator[bytes]) -> web.StreamResponse:
@@ -346,6 +348,66 @@ async def _send_events(request: web.Request, session: Session, syntax: Syntax) -
                 return response
     finally:
         session.leave(queue)
+
+
+# --- names of this machine --------------------------------------------------------------------------------------
+
+
+class Names:
+    """The names that genomixd accepts in the header Host.
+
+    Parameters
+    ----------
+    graph : Graph
+        The graph whose master has the parameter.
+    parameter : str
+        The full name of the ROS parameter `~names`: a name, or a list of them.
+    names : iterable of str
+        Names that are always accepted.
+    """
+
+    def __init__(self, graph: Graph, parameter: str, names: Iterable[str]) -> None:
+        self._graph, self._parameter = graph, parameter
+        self.known: Collection[str] = {host_name(name) for name in names} - {""}
+        self._next_read = 0.0
+        self._value: Any = []
+        self._from_parameter: Collection[str] = ()
+
+    async def from_parameter(self) -> Collection[str]:
+        """Return the names in `~names`, read at most once a second; the previous ones if the master does not answer."""
+        now = asyncio.get_running_loop().time()
+        if now >= self._next_read:
+            self._next_read = now + READ_SECONDS
+            try:
+                value = await self._graph.master("getParam", self._parameter)
+            except NotRegisteredError:
+                value = []
+            except ComponentError:
+                return self._from_parameter
+            if value != self._value:
+                self._value = value
+                self._from_parameter = _parse_names(value, self._parameter)
+        return self._from_parameter
+
+
+def parameter_name(arguments: Sequence[str], environ: Mapping[str, str] = os.environ) -> str:
+    """Return the full name of `~names` for the node name that roslaunch or `__name:=` sets."""
+    remappings = dict(text.split(":=", 1) for text in arguments if ":=" in text)
+    namespace = remappings.get("__ns", environ.get("ROS_NAMESPACE", ""))
+    path = f"{namespace}/{remappings.get('__name', 'genomixd')}/names"
+    return "/" + "/".join(filter(None, path.split("/")))
+
+
+def _parse_names(value: Any, parameter: str) -> set[str]:
+    """Return the names in the value of a ROS parameter; other texts are logged."""
+    names = set()
+    for text in value if isinstance(value, list) else [value]:
+        name = host_name(text) if isinstance(text, str) else ""
+        if name:
+            names.add(name)
+        else:
+            log.warning("%s: expected the name of a host, such as robot.lab, got %s", parameter, repr(text)[:80])
+    return names
 
 
 # --- reading ----------------------------------------------------------------------------------------------------

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import itertools
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from typing import Any, TypeVar
 
 from rosafe.interface import ComponentError
+from rosafe.ros1.client.actions import Goal
 from rosafe.ros1.client.asyncio_tools import wait_any
 from rosafe.ros1.client.component_client import NOTHING, Call, ComponentClient, Value, names
 from rosafe.ros1.client.errors import cannot_load, too_many
 from rosafe.ros1.client.graph import Graph
-from rosafe.web.genomix.activity_request import Request
+from rosafe.web.genomix import binary_format, text_formats
+from rosafe.web.genomix.text_formats import Syntax, plain
 
 MAX_SESSIONS = 1000
 MAX_REQUESTS = 1000  # kept or in progress, per session
@@ -29,10 +32,109 @@ UNUSED_SECONDS = 600.0  # during which connections are kept to a component that 
 DEAD_SECONDS = 60.0  # without an answer, until a component loaded without a session is unloaded
 CHECK_SECONDS = 10.0  # between two checks of such components
 SWEEP_SECONDS = 1.0
+REQUEST_BYTES = 4096  # size of a request without arguments and results
+EVENT_BYTES = 65_536  # larger results are not included in events and the status
+KEPT_BYTES = 1024  # smaller results remain in queued events
 ORDER_SECONDS = 5.0  # maximum time that a request waits for the acknowledgement of the previous one of its session
 
 log = logging.getLogger("genomixd")
 T = TypeVar("T")
+
+
+class Request:
+    """One request that a client follows by its id. `status` is ``sent``, ``done`` or ``error``.
+
+    Only activities are `abortable`. `size` is the approximate size of the request in bytes.
+    """
+
+    def __init__(self, number: str, abortable: bool = False, size: int = 0) -> None:
+        self.id = number
+        self.size = REQUEST_BYTES + size
+        self.status = "sent"
+        self.value: Value = NOTHING
+        self.output_size = 0
+        self._output_included = True  # in events and the status
+        self.error: ComponentError | None = None
+        self.warning = ""  # of the component that has accepted the request
+        self.acknowledged = asyncio.Event()
+        self.finished = asyncio.Event()
+        self.forgotten = asyncio.Event()  # no client follows it
+        self._abortable = abortable
+        self._aborted = False
+        self._goal: Goal | None = None
+
+    def abort(self) -> None:
+        """Ask the activity to end, or not to begin; ``::genom::syserr`` (EAGAIN) for a function in progress."""
+        if self.finished.is_set():
+            return
+        if not self._abortable:
+            why = f"{self.id} is not an activity, and cannot be aborted"
+            raise ComponentError("::genom::syserr", why, code=errno.EAGAIN)
+        self._aborted = True
+        if self._goal is not None:
+            self._goal.cancel()
+
+    def raise_if_aborted(self) -> None:
+        """Raise ``::genom::interrupted`` if the request was aborted before it was sent."""
+        if self._aborted:
+            raise ComponentError("::genom::interrupted", by="client")
+
+    def begun(self, goal: Goal) -> None:
+        """Note that the component has received the request."""
+        self._goal = goal
+        if self._aborted:
+            goal.cancel()
+
+    def finish(self, value: Value, error: ComponentError | None) -> None:
+        """Record the end."""
+        self.value, self.error, self.output_size = value, error, value.size
+        self.warning = self.warning or value.warning
+        self._output_included = self.output_size <= EVENT_BYTES
+        self.status = "done" if error is None else "error"
+        self.acknowledged.set()
+        self.finished.set()
+
+    def drop_output(self) -> None:
+        """Free the memory of a large output. Queued events then contain only its size."""
+        if self.output_size > KEPT_BYTES:
+            self.value, self._output_included = NOTHING, False
+
+    def pieces(self, syntax: Syntax) -> Iterator[str]:
+        """Yield the status as text: id, status, warning, and output or exception, if there are any."""
+        yield syntax.open("struct")
+        status = self._status_members()
+        yield "".join(
+            syntax.key(index, name) + plain(syntax, value) for index, (name, value) in enumerate(status.items())
+        )
+        if self._has_output:
+            yield syntax.key(len(status), "output")
+            yield from text_formats.structure(syntax, *self.value.content)
+        yield syntax.close("struct")
+
+    def packed(self) -> Iterator[bytes]:
+        """Yield the status in the binary format."""
+        yield binary_format.STRUCTURE
+        for name, value in self._status_members().items():
+            yield binary_format.member(name) + binary_format.plain(value)
+        if self._has_output:
+            yield binary_format.member("output")
+            yield from binary_format.structure(*self.value.content)
+        yield binary_format.END
+
+    def _status_members(self) -> dict[str, Any]:
+        """Return the status without its output."""
+        status: dict[str, Any] = {"id": self.id, "status": self.status}
+        if self.warning:
+            status["warning"] = self.warning
+        if self.error is not None:
+            status["exception"] = self.error.body
+        elif self.status == "done" and not self._output_included:
+            status["large"] = self.output_size
+        return status
+
+    @property
+    def _has_output(self) -> bool:
+        return self.status == "done" and self._output_included
 
 
 class Session:
@@ -57,7 +159,8 @@ class Session:
         self._detached_running = 0  # requests in progress that the client does not follow
         self._listened = False
         self._sessions = sessions
-        self._send_lock = asyncio.Lock()
+        self._acknowledged = asyncio.Event()  # the latest request that is sent in order
+        self._acknowledged.set()
         self.touch()
 
     # --- life ---
@@ -166,7 +269,7 @@ class Session:
     async def _follow(self, request: Request, call: Call) -> None:
         value, error = NOTHING, None
         try:
-            value = await self._in_order(call, lambda order: self._run(request, call, order))
+            value = await self._in_order(call, lambda acknowledged: self._run(request, call, acknowledged))
         except ComponentError as problem:
             error = problem
         except Exception as problem:  # an internal error must not leave the client waiting
@@ -174,7 +277,7 @@ class Session:
             error = ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
         self._finish(request, value, error)
 
-    async def _run(self, request: Request, call: Call, order: _SendOrder) -> Value:
+    async def _run(self, request: Request, call: Call, acknowledged: asyncio.Event) -> Value:
         if not call.is_activity:
             return await call.run()
         request.raise_if_aborted()
@@ -184,7 +287,7 @@ class Session:
             await goal.acknowledged.wait()
             request.warning = goal.warning
             request.acknowledged.set()
-            order.release()
+            acknowledged.set()
             if not goal.ended.is_set() and request.id in self.requests:
                 self.notify("request", request)
             await wait_any(goal.ended, request.forgotten)
@@ -194,16 +297,20 @@ class Session:
             raise goal.error
         return call.result(goal)
 
-    async def _in_order(self, call: Call, work: Callable[[_SendOrder], Coroutine[Any, Any, T]]) -> T:
-        """Return the result of `work`, for a named session after its previous request. Ports are read at once."""
-        order = _SendOrder()
-        if self.name and call.service is not None:
-            await self._send_lock.acquire()
-            order = _SendOrder(self._send_lock)
+    async def _in_order(self, call: Call, work: Callable[[asyncio.Event], Coroutine[Any, Any, T]]) -> T:
+        """Return the result of `work`, for a named session after its previous request. Ports are read at once.
+
+        `work` may set the event if the request is acknowledged before its end.
+        """
+        acknowledged = asyncio.Event()
         try:
-            return await work(order)
+            if self.name and call.service is not None:
+                previous, self._acknowledged = self._acknowledged, acknowledged
+                await previous.wait()
+                asyncio.get_running_loop().call_later(ORDER_SECONDS, acknowledged.set)
+            return await work(acknowledged)
         finally:
-            order.release()
+            acknowledged.set()
 
     def request(self, number: str) -> Request:
         """Return the request with the id `number`."""
@@ -260,21 +367,6 @@ class Session:
     def _count_bytes(self, size: int) -> None:
         self.kept += size
         self._sessions.kept += size
-
-
-class _SendOrder:
-    """An acquired lock of a session, which is released once: by its holder, or after `ORDER_SECONDS`."""
-
-    def __init__(self, lock: asyncio.Lock | None = None) -> None:
-        self._lock = lock
-        self._timer = asyncio.get_running_loop().call_later(ORDER_SECONDS, self.release) if lock is not None else None
-
-    def release(self) -> None:
-        if self._lock is not None:
-            self._lock.release()
-            self._lock = None
-        if self._timer is not None:
-            self._timer.cancel()
 
 
 class Sessions:

@@ -35,7 +35,6 @@ LIMITS = Limits(
     max_header_bytes=4 * 2**20,
     max_answers=0,  # there are no large answers
     request_seconds=AUTH_TIMEOUT_SECONDS,
-    idle_seconds=75.0,
 )
 CLOSE_SECONDS = 1.0  # for requests in progress when the server ends
 READ_ONLY_ACTIONS = {"save"}  # requests that are allowed with --watch

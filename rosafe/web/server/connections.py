@@ -1,24 +1,23 @@
 """Connections of an HTTP server, with limits on their number, duration and memory that do not depend on clients.
 
-aiohttp receives complete requests, one at a time. Data that a client sends in advance stays in the kernel, except a
-small buffer. If the connection limit is reached, the connection that has been without a request for longest is closed.
+aiohttp itself reads all requests that a client sends, has no time limit for a request or for the reading of an answer,
+and no limit on the number of connections: it takes more than 1 GB for 30 MB of requests in advance. Therefore it gets
+complete requests here, one at a time. Data that a client sends in advance stays in the kernel, except a small buffer.
+If the connection limit is reached, the connection that has been without a request for longest is closed.
 """
 
 from __future__ import annotations
 
-import array
 import asyncio
 import contextlib
-import fcntl
 import ipaddress
 import itertools
 import logging
 import re
 import resource
 import socket
-import termios
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any, cast
@@ -30,12 +29,11 @@ from rosafe.web.server.refusal import HttpRefusal
 BUFFER = 4 * 1024  # bytes of a request that are not counted; bytes read at a time
 HEADERS_SIZE = 64 * 1024  # bytes of all headers of a request
 SEND_BUFFER = 256 * 1024  # bytes of an answer in the kernel, by default up to 4 MB, which pause_writing does not report
-STALL_SECONDS = 60.0  # until a client that does not read its answer is disconnected
-YIELD_SECONDS = 5.0  # the same, if other clients need the memory
+STALL_SECONDS = 20.0  # until a client that does not read its answer is disconnected
+IDLE_SECONDS = 3600.0  # until a connection without requests is closed
 LOG_SECONDS = 60.0  # between two log entries about the connection limit
 
 _END = re.compile(rb"\r?\n\r?\n")
-_BODY = re.compile(rb"\n(?:content-length:(?![ \t]*0*[ \t]*\r?\n)|transfer-encoding:)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -54,8 +52,6 @@ class Limits:
         Bytes of all answers that clients are reading.
     request_seconds : float
         Time for a complete request from its first byte; for the first request, from the start of the connection.
-    idle_seconds : float
-        Time after which a connection without requests is closed.
     """
 
     max_connections: int
@@ -63,7 +59,6 @@ class Limits:
     max_header_bytes: int
     max_answers: int
     request_seconds: float
-    idle_seconds: float
 
 
 class ClientAccount:
@@ -102,26 +97,31 @@ class Connections:
         self.format_refusal = format_refusal
         self._log = log
         self._accounts: dict[str, ClientAccount] = {}
-        self._count = 0
         self._logged_at = -LOG_SECONDS
-        self.header_bytes = 0  # of long requests
-        self._answers: dict[HttpConnection, tuple[object, int]] = {}  # answers being read, and their bytes
+        self.long_requests: dict[HttpConnection, int] = {}  # bytes of the requests that are longer than `BUFFER`
+        self._answers: dict[object, tuple[object, int]] = {}  # answers being read, and their bytes, by reading
 
     def admit(self, connection: HttpConnection, address: str) -> ClientAccount | None:
         """Return the account of a new connection; None if the limit is reached and no other one can be closed."""
         account = self._accounts.get(address) or ClientAccount(address)
         full = len(account.connections) >= self._max_per_address
-        if full or self._count >= self._max:
-            self._log_full(account.address)
-            longest = _silent_longest([account] if full else self._accounts.values())
+        if full or sum(len(one.connections) for one in self._accounts.values()) >= self._max:
+            self._log_full(address)
+            longest = self._silent_longest([account] if full else list(self._accounts.values()))
             if longest is None:
                 return None
             longest.drop()
         self._accounts[address] = account
         account.connections.add(connection)
         account.silent[connection] = None
-        self._count += 1
         return account
+
+    @staticmethod
+    def _silent_longest(accounts: list[ClientAccount]) -> HttpConnection | None:
+        """Return the connection to close: of the address with most connections, authenticated ones last."""
+        accounts.sort(key=lambda account: len(account.connections), reverse=True)
+        groups = [*(account.silent for account in accounts), *(account.idle for account in accounts)]
+        return next(itertools.chain.from_iterable(groups), None)
 
     def _log_full(self, address: str) -> None:
         if time.monotonic() > self._logged_at + LOG_SECONDS:
@@ -131,25 +131,25 @@ class Connections:
     def forget(self, connection: HttpConnection) -> None:
         """Remove a connection that has ended."""
         account = connection.account
-        self._answers.pop(connection, None)
+        self.long_requests.pop(connection, None)
         account.long_polls.discard(connection)
         account.silent.pop(connection, None)
         account.idle.pop(connection, None)
         if connection in account.connections:
             account.connections.remove(connection)
-            self._count -= 1
             if not account.connections:
-                self._accounts.pop(account.address, None)
+                del self._accounts[account.address]
 
-    def make_room_for_header(self, connection: HttpConnection) -> bool:
+    def make_room(self, connection: HttpConnection) -> bool:
         """Close the connections that have been sending a long request for longest; return whether that suffices."""
-        for account in list(self._accounts.values()):
-            for other in list(account.silent):
-                if self.header_bytes <= self.limits.max_header_bytes:
-                    return True
-                if other.has_long_header and other is not connection:
-                    other.drop()
-        return self.header_bytes <= self.limits.max_header_bytes
+        total = sum(self.long_requests.values())
+        for other, size in list(self.long_requests.items()):
+            if total <= self.limits.max_header_bytes:
+                break
+            if other is not connection and other in other.account.silent:
+                other.drop()
+                total -= size
+        return total <= self.limits.max_header_bytes
 
     @contextlib.contextmanager
     def long_poll(self, connection: HttpConnection) -> Iterator[None]:
@@ -170,45 +170,25 @@ class Connections:
             polls.discard(connection)
 
     @contextlib.contextmanager
-    def reading_answer(self, connection: HttpConnection, data: object, size: int) -> Iterator[None]:
+    def reading_answer(self, data: object, size: int) -> Iterator[None]:
         """Account for an answer while a client reads it: `data` of `size` bytes, which other clients may share.
-
-        Clients that have stopped reading their answers are disconnected if the memory is needed.
 
         Raises
         ------
         HttpRefusal
             If there is not enough memory.
         """
-        for other in list(self._answers):
-            if self._fits(data, size):
-                break
-            if other.stalled(YIELD_SECONDS):
-                other.drop()
-        if not self._fits(data, size):
+        sizes = {id(answer): answer_size for answer, answer_size in self._answers.values()}
+        if sizes and id(data) not in sizes and sum(sizes.values()) + size > self.limits.max_answers:
             raise HttpRefusal(
                 503, f"clients are reading {self.limits.max_answers >> 20} MiB of answers; try again later"
             )
-        self._answers[connection] = (data, size)
+        reading = object()
+        self._answers[reading] = data, size
         try:
             yield
         finally:
-            self._answers.pop(connection, None)
-
-    def _fits(self, data: object, size: int) -> bool:
-        sizes = {id(answer): answer_size for answer, answer_size in self._answers.values()}
-        return not sizes or id(data) in sizes or sum(sizes.values()) + size <= self.limits.max_answers
-
-
-def _silent_longest(accounts: Iterable[ClientAccount]) -> HttpConnection | None:
-    """Return the connection to close: of the address with most connections, authenticated ones last.
-
-    A connection whose data is still unread is not silent, and is only chosen if all others have unread data as well.
-    """
-    accounts = sorted(accounts, key=lambda account: len(account.connections), reverse=True)
-    groups = [*(account.silent for account in accounts), *(account.idle for account in accounts)]
-    candidates = list(itertools.chain.from_iterable(groups))
-    return next((one for one in candidates if not one.has_unread_data), candidates[0] if candidates else None)
+            del self._answers[reading]
 
 
 class HttpConnection(web.RequestHandler):
@@ -218,7 +198,12 @@ class HttpConnection(web.RequestHandler):
         loop = asyncio.get_running_loop()
         limits = connections.limits
         super().__init__(
-            server, loop=loop, max_line_size=limits.max_url, keepalive_timeout=limits.idle_seconds, **options
+            server,
+            loop=loop,
+            max_line_size=limits.max_url,
+            keepalive_timeout=IDLE_SECONDS,
+            lingering_time=0.0,  # a request with a body ends the connection
+            **options,
         )
         self.account = ClientAccount("")
         self.gone = asyncio.Event()
@@ -229,10 +214,8 @@ class HttpConnection(web.RequestHandler):
         self._ahead = bytearray()  # received, but not passed on to aiohttp yet
         self._searched = 0  # bytes of `_ahead` that contain no end of a header
         self._head = 0  # bytes of the request in progress
-        self._counted = 0  # bytes of both that are accounted for
         self._deadline: asyncio.TimerHandle | None = None
         self._stall: asyncio.TimerHandle | None = None
-        self._stalled_at = 0.0
 
     # --- for the server ---
 
@@ -250,6 +233,7 @@ class HttpConnection(web.RequestHandler):
         self._socket.set_write_buffer_limits()  # the WebSocket's own limits apply
         super().data_received(bytes(self._ahead))
         self._ahead.clear()
+        self._head = 0
         self._account_header()
         self._socket.resume_reading()
 
@@ -257,22 +241,6 @@ class HttpConnection(web.RequestHandler):
         """Close the connection immediately, whatever its state; unread data is lost."""
         self._leave()
         self._socket.abort()
-
-    @property
-    def has_unread_data(self) -> bool:
-        """Whether the client has sent something that the event loop has not read yet."""
-        count = array.array("i", [0])
-        fcntl.ioctl(self._socket.get_extra_info("socket").fileno(), termios.FIONREAD, count)
-        return count[0] > 0
-
-    @property
-    def has_long_header(self) -> bool:
-        """Whether its header is long enough to be accounted for."""
-        return self._counted > 0
-
-    def stalled(self, seconds: float) -> bool:
-        """Return whether the client has read nothing of its answer for at least `seconds`."""
-        return self._stall is not None and self._loop.time() - self._stalled_at >= seconds
 
     # --- the connection ---
 
@@ -282,14 +250,12 @@ class HttpConnection(web.RequestHandler):
         self._socket.set_write_buffer_limits(high=0)  # so that pause_writing reports everything that is not read
         self._socket.max_size = BUFFER  # type: ignore[attr-defined]  # asyncio reads 256 KiB at a time
         account = self._connections.admit(self, _address(transport.get_extra_info("peername")))
-        if account is None:
-            self.gone.set()
-            self._socket.write(self._refusal(HttpRefusal(503, "the connection limit is reached")))
-            self._socket.close()
-            return
-        self.account = account
-        self._start_deadline()
         super().connection_made(transport)
+        if account is None:
+            self._refuse(HttpRefusal(503, "the connection limit is reached"))
+        else:
+            self.account = account
+            self._start_deadline()
 
     def connection_lost(self, exc: BaseException | None) -> None:
         self._leave()
@@ -300,25 +266,20 @@ class HttpConnection(web.RequestHandler):
     def _leave(self) -> None:
         """Release the connection's place and memory."""
         self.gone.set()
-        self._connections.forget(self)
         self._ahead.clear()
-        self._head = 0
-        self._account_header()
+        self._connections.forget(self)
         self._cancel_deadline()
 
     def _refuse(self, refusal: HttpRefusal) -> None:
+        """Send a complete answer and close the connection, in cases in which aiohttp is not involved."""
         self._leave()
-        self._socket.write(self._refusal(refusal))
-        self.force_close()
-
-    def _refusal(self, refusal: HttpRefusal) -> bytes:
-        """Return a complete answer, for cases in which aiohttp is not involved."""
         body, media_type = self._connections.format_refusal(refusal)
         head = (
             f"HTTP/1.1 {refusal.status} {HTTPStatus(refusal.status).phrase}\r\nContent-Type: {media_type}; "
             f"charset=utf-8\r\nConnection: close\r\nContent-Length: {len(body)}\r\n\r\n"
         )
-        return head.encode() + body
+        self._socket.write(head.encode() + body)
+        self.force_close()
 
     # --- requests ---
 
@@ -330,7 +291,7 @@ class HttpConnection(web.RequestHandler):
             return
         self._ahead += data
         self._account_header()
-        if self._counted and not self._connections.make_room_for_header(self):
+        if self in self._connections.long_requests and not self._connections.make_room(self):
             limit = self._connections.limits.max_header_bytes
             self._refuse(HttpRefusal(503, f"long requests occupy {limit >> 20} MiB; try again later"))
         elif not self._busy:
@@ -341,25 +302,19 @@ class HttpConnection(web.RequestHandler):
     def _next_request(self) -> None:
         if not self._searched:
             del self._ahead[: len(self._ahead) - len(self._ahead.lstrip(b"\r\n"))]  # RFC 9112, section 2.2
+        if self._ahead and self._deadline is None:
+            self._start_deadline()
         end = _END.search(self._ahead, max(0, self._searched - 3))
         if end is None:
             self._searched = len(self._ahead)
             limit = self._connections.limits.max_url + HEADERS_SIZE
             if self._searched > limit:
                 self._refuse(HttpRefusal(400, f"request: expected at most {limit >> 10} KiB"))
-            elif self._ahead and self._deadline is None:
-                self._start_deadline()
             return
         head = bytes(self._ahead[: end.end()])
         del self._ahead[: end.end()]
-        self._searched, self._head = 0, len(head)
-        if _BODY.search(head):
-            self._refuse(HttpRefusal(400 if head.startswith(b"GET ") else 405, "expected a GET request without a body"))
-            return
-        self._busy = True
+        self._searched, self._head, self._busy = 0, len(head), True
         self._waiting.pop(self, None)
-        if self._deadline is None:
-            self._start_deadline()  # in case aiohttp does not find the end of the header
         super().data_received(head)
 
     async def finish_response(self, *arguments: Any) -> Any:
@@ -402,9 +357,10 @@ class HttpConnection(web.RequestHandler):
 
     def _account_header(self) -> None:
         size = self._head + len(self._ahead)
-        counted = size if size > BUFFER else 0
-        self._connections.header_bytes += counted - self._counted
-        self._counted = counted
+        if size > BUFFER:
+            self._connections.long_requests[self] = size
+        else:
+            self._connections.long_requests.pop(self, None)
 
     def _start_deadline(self) -> None:
         seconds = self._connections.limits.request_seconds
@@ -420,7 +376,6 @@ class HttpConnection(web.RequestHandler):
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        self._stalled_at = self._loop.time()
         self._stall = self._loop.call_later(STALL_SECONDS, self.drop)
 
     def resume_writing(self) -> None:
@@ -432,11 +387,9 @@ class HttpConnection(web.RequestHandler):
 
 def _address(peer: Any) -> str:
     """Return the account of a connection: its IPv4 address, "loopback", or the /64 network of its IPv6 address."""
-    if not peer:
+    if not peer:  # disconnected already
         return ""
     address = ipaddress.ip_address(str(peer[0]).partition("%")[0])
-    if isinstance(address, ipaddress.IPv6Address):
-        if address.ipv4_mapped is None:
-            return "loopback" if address.is_loopback else str(ipaddress.ip_network((address, 64), strict=False))
-        address = address.ipv4_mapped
-    return "loopback" if address.is_loopback else str(address)
+    if address.is_loopback:
+        return "loopback"
+    return str(address if address.version == 4 else ipaddress.ip_network((address, 64), strict=False))

@@ -14,7 +14,7 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.ros1.localizer.frame_queue import FrameQueue
 from rosafe.ros1.localizer.frame_source import NewFrames
 from rosafe.ros1.localizer.head_rotation import FixedHead, Rotation
-from rosafe.ros1.localizer.mute import Mute
+from rosafe.ros1.localizer.mute import AFTER_SECONDS, Mute
 from rosafe.ros1.localizer.status import NodeStatus
 
 
@@ -77,6 +77,15 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 def is_muted(mute: Mute, time: float) -> bool:
     """Return whether sources are hidden, or a frame at `time` is not used."""
     return mute.active or bool(mute.muted(np.array([time])).any())
+
+
+def test_a_mute_lasts_a_little_longer_and_delays_count(clock: list[float]) -> None:
+    mute = Mute(0.25, NodeStatus(lambda: None))
+    mute._receive(Bool(True))
+    clock[0] = 105.0
+    mute._receive(Bool(False))
+    end = 105.25 + AFTER_SECONDS
+    assert mute.muted(np.array([100.2, 100.3, end - 0.05, end + 0.05])).tolist() == [False, True, True, False]
 
 
 def test_a_mute_has_ended_if_the_time_jumps_back(clock: list[float]) -> None:

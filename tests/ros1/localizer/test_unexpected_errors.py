@@ -165,3 +165,14 @@ def test_messages_that_are_not_finite(fake: Fake, log: list[str]) -> None:
     fake.faults = {}
     wait_for(lambda: fake.status.state()[0] == OK)
     assert not log
+
+
+def test_the_state_is_the_worst_and_among_several_the_newest() -> None:
+    status = NodeStatus(lambda: None)
+    states = []
+    for part, level in (("a", OK), ("b", WARN), ("c", WARN), ("b", WARN), ("d", OK)):
+        status.set(part, level, part, log=False)
+        states.append(status.state()[1])
+    assert states == ["a", "b", "c", "b", "b"]
+    status.clear("b")
+    assert status.state() == (WARN, "c")

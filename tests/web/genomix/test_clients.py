@@ -1,136 +1,171 @@
-"""Many, invalid and disappearing clients: genomixd serves the others and releases all resources."""
+"""Many, invalid and disappearing clients of a running genomixd: it serves the others and releases all resources."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import http.client
 import json
+import re
+import resource
+import select
 import signal
 import socket
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from urllib.parse import quote, quote_plus
 
 import aiohttp
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
+from rosafe import interface
 from tests import harness
+from tests.harness import proc, wait_for
 from tests.web.genomix import world as worlds
 from tests.web.genomix.test_server import live_activities, start_tree
-from tests.web.genomix.world import World
+from tests.web.genomix.world import HttpError, World
 
 pytestmark = pytest.mark.ros
 
-
-# --- web pages --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "headers",
-    [
-        {"Origin": "http://evil.example"},
-        {"Origin": "null"},
-        {"Origin": "http://127.0.0.1:8080"},
-        {"Referer": "http://evil.example/page"},
-        {"Sec-Fetch-Site": "cross-site"},
-        {"Sec-Fetch-Site": "none"},
-        {"Sec-Fetch-Mode": "no-cors"},
-        {"Sec-Fetch-Dest": "image"},
-        {"User-Agent": "Mozilla/5.0 (X11; Linux x86_64; rv:128.0) Gecko/20100101 Firefox/128.0"},
-        {"Host": "evil.example"},
-        {"Host": "evil.example:8080"},
-        {"Host": "localhost.evil.example"},
-        {"Host": "127.0.0.1.evil.example"},
-        {"Host": ""},
-    ],
-    ids=str,
-)
-def test_requests_from_web_pages_are_rejected(world: World, headers: dict[str, str]) -> None:
-    for url in ("/call/bass/Acquire?input=%5B%22scene:%22%5D", "/session/listen?s=x", "/session/stop?s=x", "/none"):
-        status, body = world.http.raw(url, headers=headers)
-        assert (status, json.loads(body)["ex"]) == (403, "::genomix::e_forbidden")
-    assert live_activities(world, "bass") == []
-
-
-@pytest.mark.parametrize(
-    "host", ["localhost", "LOCALHOST:80", "127.0.0.1", "[::1]:8080", "10.1.2.3", socket.gethostname()]
-)
-def test_names_of_this_machine_are_accepted(world: World, host: str) -> None:
-    assert world.http.raw("/components", headers={"Host": host})[0] == 200
-
-
-@pytest.mark.parametrize("method", ["HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH", "TRACE"])
-def test_only_get(world: World, method: str) -> None:
-    assert world.http.raw("/call/bass/Stop", method=method)[0] == 405
-    headers = {"Origin": "http://evil.example", "Access-Control-Request-Method": "GET"}
-    assert world.http.raw("/call/bass/Stop", method="OPTIONS", headers=headers)[0] == 403
-
-
-# --- sizes and counts -------------------------------------------------------------------------------------------
-
-
-def test_the_longest_list_is_accepted_and_longer_ones_are_rejected(world: World) -> None:
-    start_tree(world.http)
-    longest = [100 + 0.123456789012 * i for i in range(1024)]
-    world.http.call("rosAFE/GammatoneProc", {"name": "long", "fb_cfHz": [str(f) for f in longest]})
-    gammatones = world.http.call("rosAFE/getParameters")["parameters"]["gammatone"]
-    assert gammatones[1]["fb_cfHz"] == longest
-    assert world.http.raw("/call/rosAFE/PreProc?input=" + "x" * 300_000)[0] == 400
-    assert world.http.raw("/components", headers={"X": "y" * 100_000})[0] == 400
-
-
-FORGETFUL = """
-from rosafe.web.genomix import sessions
-sessions.MAX_REQUESTS = 50
+GET = "GET {} HTTP/1.1\r\nHost: localhost\r\n\r\n"
+# Small attacks reach these limits: a fifth of the sessions and of the connections, little memory and time.
+SMALL = """
+from dataclasses import replace
+from rosafe.web.genomix import routes, sessions
+from rosafe.web.server import connections
+routes.LIMITS = replace(routes.LIMITS, max_connections=400, max_answers=50 * 2**20)
+sessions.MAX_SESSIONS, sessions.MAX_REQUESTS = 200, 50
+connections.STALL_SECONDS = 1.0
 """
 
 
-def test_requests_and_listeners_are_limited(world: World) -> None:
-    async def get(client: aiohttp.ClientSession, url: str) -> str:
-        """Return the error's name, empty for none."""
-        async with client.get(f"http://127.0.0.1:{http.port}{url}") as response:
-            return "" if response.status == 200 else str((await response.json(content_type=None))["ex"])
-
-    async def check() -> None:
-        async with aiohttp.ClientSession() as client:
-            for _ in range(60):  # finished requests make room
-                assert await get(client, "/send/bass/connect_service?s=many&input=%5B%22a%22,%22b%22%5D") == ""
-            listeners = [await client.get(f"http://127.0.0.1:{http.port}/session/listen?s=s0") for _ in range(8)]
-            assert await get(client, "/session/listen?s=s0") == "::genomix::e_tooMany"
-            for listener in listeners:
-                assert listener.status == 200
-                listener.close()
-
-    with worlds.changed_genomixd(world, FORGETFUL) as forgetful:
-        http = forgetful.http
-        asyncio.run(check())
-        assert len(http.get("/requests", s="many")) == 50
+@pytest.fixture(scope="module")
+def small_world(shared_world: World) -> Iterator[World]:
+    """The world of the module, with a genomixd for a few clients."""
+    with worlds.changed_genomixd(shared_world, SMALL) as world:
+        yield world
 
 
-@pytest.mark.parametrize(
-    "garbage",
-    [
-        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
-        b"GET\r\n\r\n",
-        b"GET / HTTP/9.9\r\n\r\n",
-        b"GET /" + b"a" * 400_000,
-        b"GET / HTTP/1.1\r\nHost: localhost\r\nContent-Length: -1\r\n\r\n",
-        b"GET / HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
-        b"\0" * 10_000,
-    ],
-    ids=range(7),
-)
-def test_invalid_data_does_not_affect_other_clients(world: World, garbage: bytes) -> None:
-    with socket.create_connection(("127.0.0.1", world.port), timeout=harness.PATIENCE) as connection:
-        try:
-            connection.sendall(garbage)
-            with contextlib.suppress(OSError):  # the server may have closed the connection
-                connection.shutdown(socket.SHUT_WR)
-            while connection.recv(65536):
-                continue
-        except ConnectionError:
-            pass  # disconnected, as expected
-    assert world.http.get("/components", s="fresh") == {}
+@pytest.fixture
+def small(world: World, small_world: World) -> World:
+    """The same, with idle components."""
+    return small_world
 
 
-# --- many at once -----------------------------------------------------------------------------------------------
+@contextmanager
+def crowd(port: int, requests: list[str]) -> Iterator[list[socket.socket]]:
+    """Open connections that each have sent some text and read nothing."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    with ExitStack() as stack:
+        sockets = []
+        for text in requests:
+            connection = stack.enter_context(socket.socket())
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            connection.settimeout(harness.PATIENCE)
+            connection.connect(("127.0.0.1", port))
+            with suppress(ConnectionError):  # already disconnected
+                connection.sendall(text.encode("latin-1"))
+            sockets.append(connection)
+        yield sockets
+
+
+def open_files(pid: int) -> int:
+    return len(list(proc(pid, "fd").iterdir()))
+
+
+def resident(pid: int) -> int:
+    """Return the memory of a process in MB."""
+    found = re.search(r"VmRSS:\s+(\d+)", proc(pid, "status").read_text())
+    assert found is not None
+    return int(found[1]) // 1024
+
+
+def served(world: World) -> None:
+    """A new HTTP client and a new Tcl client are served."""
+    assert list(world.http.call("rosAFE/getParameters", s=f"fresh{time.monotonic()}")) == ["parameters"]
+    script = "set g [genomix::connect $address]; $g load rosAFE; show [dict keys [rosAFE::getParameters]]"
+    assert world.lines(script) == ["parameters"]
+
+
+# --- connections and requests -----------------------------------------------------------------------------------
+
+
+def test_an_idle_client_continues_after_an_attack(small: World) -> None:
+    """Its connection is closed for other clients and it opens a new one; its event connection remains open."""
+    world = small
+    go = world.graph.home / "go"
+    script = world.graph.home / "idle.tcl"
+    script.write_text(f"""
+        package require genomix
+        set g [genomix::connect 127.0.0.1:{world.port}]
+        $g load bass
+        set request [bass::Acquire scene: &]
+        while {{[$request wait 100] eq "sent" && [dict get [bass::Audio] Audio lastFrameIndex] == 0}} continue
+        puts ready
+        flush stdout
+        while {{![file exists {go}]}} {{after 20}}
+        bass::Stop
+        puts [$request wait]
+    """)
+    with world.graph.start("tclsh", str(script)) as client:
+        wait_for(lambda: "ready" in client.out, what=lambda: repr(client))
+        with crowd(world.port, ["GET /call/rosAFE/getSignals HTTP/1.1\r\nHost: loc"] * 500):
+            wait_for(lambda: "idle connections are closed" in world.server.err)
+            served(world)
+            go.touch()
+            assert client.wait() == 0
+        assert client.out.split() == ["ready", "done"]
+    assert world.server.err.count("connection limit reached, now by loopback") < 100  # once a minute
+
+
+def test_pipelined_requests_are_answered_in_order(world: World) -> None:
+    """Queued and fragmented requests are answered; empty lines before a request are ignored."""
+    names = [f"p{number}" for number in range(600)]
+    urls = [f"/session/start?s={name}" for name in names[:200]] + [f"/nothing/{name}" for name in names[200:]]
+    sent = b"".join(b"\r\n" + GET.format(url).encode() for url in urls)
+    with socket.create_connection(("127.0.0.1", world.port), timeout=90) as connection, ThreadPoolExecutor(1) as pool:
+        sending = pool.map(connection.sendall, (sent[i : i + 999] for i in range(0, len(sent), 999)))
+        answers = b""
+        while answers.count(b"HTTP/1.1 ") < len(names) or not answers.endswith(b"}"):
+            part = connection.recv(65536)
+            assert part
+            answers += part
+        assert len(list(sending)) == len(sent) // 999 + 1
+    assert re.findall(r"(?:\r\n\r\n|GET /nothing/)(p\d+)", answers.decode()) == names
+
+
+def test_unread_answers_are_dropped(small: World, world: World) -> None:
+    start_tree(world.http)
+    url = "/call/rosAFE/gammatonePort/gammatone?syntax=packed"
+    wait_for(lambda: world.http.call("rosAFE/gammatonePort/gammatone")["gammatonePort"]["lastFrameIndex"] > 0)
+    pid = small.server.pid
+    small.http.call("rosAFE/gammatonePort/gammatone")  # it connects to the component
+    files, memory = open_files(pid), resident(pid)
+    with crowd(small.port, [GET.format(url)] * 100) as unread:  # of 3 MB; most of them share one
+        for connection in unread:
+            assert select.select((connection,), (), (), harness.PATIENCE)[0]
+        assert resident(pid) < memory + 200
+        assert small.http.raw("/components")[0] == 200
+        # All of them are closed; the connections to the component remain.
+        wait_for(lambda: open_files(pid) < files + 50, what=lambda: f"{open_files(pid)} files")
+
+
+def test_a_large_download_does_not_delay_other_clients(world: World) -> None:
+    start_tree(world.http)
+    wait_for(lambda: world.http.call("rosAFE/gammatonePort/gammatone")["gammatonePort"]["lastFrameIndex"] > 0)
+    with crowd(world.port, [GET.format("/call/rosAFE/gammatonePort/gammatone")]) as (slow,):
+        assert slow.recv(100).startswith(b"HTTP/1.1 200 OK")
+        for _ in range(20):
+            assert world.http.call("rosAFE/getDependencies", ["input"]) == {"dependencies": ["input"]}
+        parts = [b""]
+        while not parts[-1].endswith(b"0\r\n\r\n"):
+            parts.append(slow.recv(1 << 20))
+            assert parts[-1]
+        assert b"".join(parts).count(b"dataN") == 2
 
 
 def test_a_hundred_concurrent_clients(world: World) -> None:
@@ -152,62 +187,110 @@ def test_a_hundred_concurrent_clients(world: World) -> None:
     assert asyncio.run(all_clients()) == [["gammatone"] * 3] * 100
 
 
-def test_a_large_download_does_not_delay_other_clients(world: World) -> None:
-    """A client that reads getSignals slowly, or not at all, does not delay others."""
+def test_web_pages_start_nothing(world: World) -> None:
+    for url in ("/call/bass/Acquire?input=%5B%22scene:%22%5D", "/session/listen?s=x", "/session/stop?s=x", "/none"):
+        status, body = world.http.raw(url, headers={"Origin": "http://evil.example"})
+        assert (status, json.loads(body)["ex"]) == (403, "::genomix::e_forbidden")
+    assert live_activities(world, "bass") == []
+
+
+def test_the_longest_list_is_accepted_and_longer_ones_are_rejected(world: World) -> None:
     start_tree(world.http)
+    longest = [100 + 0.123456789012 * i for i in range(1024)]
+    world.http.call("rosAFE/GammatoneProc", {"name": "long", "fb_cfHz": [str(f) for f in longest]})
+    gammatones = world.http.call("rosAFE/getParameters")["parameters"]["gammatone"]
+    assert gammatones[1]["fb_cfHz"] == longest
+    assert world.http.raw("/call/rosAFE/PreProc?input=" + "x" * 300_000)[0] == 400
 
-    def large() -> bool:
-        return world.http.call("rosAFE/gammatonePort/gammatone")["gammatonePort"]["lastFrameIndex"] > 0
 
-    harness.wait_for(large)
-    slow = socket.create_connection(("127.0.0.1", world.port))
-    slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
-    slow.sendall(b"GET /call/rosAFE/gammatonePort/gammatone HTTP/1.1\r\nHost: localhost\r\n\r\n")
-    assert slow.recv(100).startswith(b"HTTP/1.1 200 OK")
-    for _ in range(20):
-        assert world.http.call("rosAFE/getDependencies", ["input"]) == {"dependencies": ["input"]}
-    parts = [b""]
-    while not parts[-1].endswith(b"0\r\n\r\n"):
-        parts.append(slow.recv(1 << 20))
-        assert parts[-1]
-    assert b"".join(parts).count(b"dataN") == 2
-    slow.close()
+# --- sessions, requests and loads -------------------------------------------------------------------------------
+
+
+def test_many_sessions_do_not_lock_out_other_clients(small: World) -> None:
+    world = small
+    world.http.get("/load/bass", s="mine")
+    with world.http.listening(s="mine") as events:
+        number = world.http.send("bass/Acquire", {"device": "scene:"}, s="mine", ack=1)
+        assert next(events)[0] == "request"
+        for other in range(400):
+            assert world.http.raw(f"/session/start?s=attack{other}")[0] == 200
+        served(world)
+        assert world.http.status(number, s="mine")["status"] == "sent"  # it has a listener
+
+
+def test_requests_and_listeners_are_limited(small: World) -> None:
+    for _ in range(60):  # finished requests make room
+        small.http.send("bass/connect_service", ["a", "b"], s="many")
+    assert len(small.http.get("/requests", s="many")) == 50
+    with ExitStack() as stack:
+        for _ in range(8):
+            stack.enter_context(small.http.listening(s="s0"))
+        with pytest.raises(AssertionError), small.http.listening(s="s0"):
+            pass
+        status, body = small.http.raw("/session/listen?s=s0")
+        assert (status, json.loads(body)["ex"]) == (503, "::genomix::e_tooMany")
+
+
+def test_absent_components_do_not_delay_load(world: World) -> None:
+    absent = [GET.format(f"/load/absent{number}") for number in range(200)]
+    with world.graph.node("bass-ros", "-i", "waited"), crowd(world.port, absent) as waiting:
+        assert world.http.get("/load/bass", i="waited")["instance"] == "waited"
+        for connection in waiting:
+            assert connection.recv(12).endswith(b" 502")
+    served(world)
+
+
+def test_many_names_for_one_component(world: World) -> None:
+    """The oldest component names of a session are dropped; an instance is found again by its own name."""
+    for number in range(70):
+        world.http.get("/load/bass", s="names", **{"as": f"x{number}"})
+    loaded = world.http.get("/components", s="names")
+    assert len(loaded) == 64 and "x69" in loaded and "x0" not in loaded
+    assert world.http.call("x0/Stop", s="names", i="bass") == {}
+    assert world.http.call("bass/Stop", s="names") == {}
 
 
 # --- clients that vanish ----------------------------------------------------------------------------------------
 
 
-def open_files(pid: int) -> int:
-    return len(list(harness.proc(pid, "fd").iterdir()))
+def test_waiting_clients_that_vanish_are_forgotten(small: World) -> None:
+    """Their requests would otherwise wait for an hour and occupy connections."""
+    world = small
+    number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
+    for _ in range(12):
+        with crowd(world.port, [GET.format(f"/request/wait?s=t&id={number}")] * 20):
+            pass
 
+    def listening() -> bool:
+        with suppress(AssertionError), world.http.listening(s="t"):  # rejected while they occupy all connections
+            return True
+        return False
 
-def threads(pid: int) -> int:
-    return len(list(harness.proc(pid, "task").iterdir()))
+    wait_for(listening)
+    assert world.http.get("/request/wait", id=number, s="t", ms=10)["status"] == "sent"
 
 
 def test_disappeared_clients_leave_no_resources(world: World) -> None:
     start_tree(world.http)
     world.http.call("rosAFE/getDependencies", ["input"], s="survivor")
     pid = world.server.pid
-    files, before = open_files(pid), threads(pid)
+
+    def threads() -> int:
+        return len(list(proc(pid, "task").iterdir()))
+
+    files, before = open_files(pid), threads()
     for number in range(30):
-        listener = socket.create_connection(("127.0.0.1", world.port))
-        listener.sendall(f"GET /session/listen?s=v{number} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
-        assert listener.recv(100).startswith(b"HTTP/1.1 200")
         world.http.send("rosAFE/getDependencies", ["input"], s=f"v{number}")
-        half = socket.create_connection(("127.0.0.1", world.port))
-        half.sendall(b"GET /call/rosAFE/getSignals HTTP/1.1\r\nHost: loc")
-        download = socket.create_connection(("127.0.0.1", world.port))
-        download.sendall(b"GET /call/rosAFE/inputProcPort HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        download.recv(100)
-        for connection in (listener, half, download):
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # a reset, as from a crash
-            connection.close()
-    harness.wait_for(lambda: open_files(pid) <= files + 8, what=lambda: f"{open_files(pid)} files, {files} before")
-    assert threads(pid) <= before + 20  # the threads of the pool remain
+        urls = (f"/session/listen?s=v{number}", "/call/rosAFE/inputProcPort")
+        with crowd(world.port, [*map(GET.format, urls), "GET /call/rosAFE/getSignals HTTP/1.1\r\nHost: loc"]) as gone:
+            assert all(one.recv(100).startswith(b"HTTP/1.1 200") for one in gone[:2])
+            for connection in gone:  # a reset, as from a crash
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
+    wait_for(lambda: open_files(pid) <= files + 8, what=lambda: f"{open_files(pid)} files, {files} before")
+    assert threads() <= before + 20  # the threads of the pool remain
 
 
-def test_a_client_that_is_killed_takes_its_session_with_it(world: World) -> None:
+def test_the_activity_of_a_killed_client_continues(world: World) -> None:
     script = world.graph.home / "client.tcl"
     script.write_text(f"""
         package require genomix
@@ -219,7 +302,112 @@ def test_a_client_that_is_killed_takes_its_session_with_it(world: World) -> None
         vwait forever
     """)
     with world.graph.start("tclsh", str(script)) as client:
-        assert harness.wait_for(lambda: client.out.strip()).endswith("sent")
+        assert wait_for(lambda: client.out.strip()).endswith("sent")
         client.stop(signal.SIGKILL)
-    # The activity belongs to the component and continues.
-    harness.wait_for(lambda: live_activities(world, "bass") == ["Acquire"])
+    wait_for(lambda: live_activities(world, "bass") == ["Acquire"])
+
+
+# --- texts ------------------------------------------------------------------------------------------------------
+
+
+def test_unpaired_surrogates_are_rejected_everywhere(world: World) -> None:
+    half, bad = quote('"\\ud800"'), "%ED%A0%80"
+    name, device = quote('"nameProc"'), quote('"device"')
+    urls = [
+        *(
+            f"/call/rosAFE/getDependencies?input={given}"
+            for given in (f"[{half}]", f"{{{name}:{half}}}", "[%22\xff%22]")
+        ),
+        f"/call/rosAFE/request?input=[{half}]",
+        f"/call/bass/Acquire?input={{{device}:{half}}}",
+        f"/send/bass/Acquire?argv=[{half}]&oneway=1",
+        f"/call/rosAFE/ildPort/{bad}",
+        f"/call/rosAFE/ildPort?element={bad}",
+        f"/call/{bad}/getSignals",
+        f"/load/{bad}",
+        f"/load/rosAFE?i={bad}",
+        f"/load/rosAFE?as={bad}",
+        f"/components?s={bad}",
+        f"/components?syntax={bad}",
+        f"/request/status?id={bad}",
+        "/\xff",
+    ]
+    with crowd(world.port, [GET.format(url) for url in urls]) as connections:
+        assert [connection.recv(12)[9:] for connection in connections] == [b"400"] * len(urls)
+    assert "Traceback" not in world.server.err
+    reported = "GENOM ::genom::serialization {what {URL: expected UTF-8}}"
+    script = r"""
+        set g [genomix::connect $address]
+        $g load rosAFE
+        show [lindex [failure {rosAFE::getDependencies [list nameProc \ud800]}] 1]
+        show [lindex [failure {rosAFE::ildPort \udfff}] 1]
+        show [lindex [failure {$g load bass -i \ud800}] 1]
+    """
+    assert world.lines(script) == [reported] * 3
+    command = ("sh", "-c", r"""rosafe request ild --connect "$(printf '\355\240\200')" """)
+    done = world.graph.run(*command, check=False)
+    assert done.returncode == 1 and "Traceback" not in done.stderr and done.stderr.count("\n") == 1
+    with pytest.raises(HttpError, match="contains an unpaired UTF-16 surrogate"):
+        world.http.call("bass/Acquire", ["\ud800"])
+
+
+# sockets between genomixd and the components that it has loaded: of five topics for each activity, both ways, and more
+LINKS = 9 * sum(len(component.activities) for component in interface.COMPONENTS.values())
+
+texts = st.text(max_size=20)
+services = [f"{c.name}/{s.name}" for c, s in interface.all_services() if s.name != "kill"]
+ports = [f"{c.name}/{p.name}" for c in interface.COMPONENTS.values() for p in c.ports]
+parameters = sorted({p.name for _, s in interface.all_services() for p in s.parameters})
+FIXED = ["/", "/components", "/requests", "/rpath", "/session/start", "/session/stop", "/unload/bass", "/describe/bass"]
+paths = st.one_of(
+    st.sampled_from([f"/{verb}/{target}" for verb in ("call", "send") for target in services + ports]),
+    st.builds("/{}/rosAFE/{}".format, st.sampled_from(["call", "send"]), texts.map(quote)),
+    st.builds("/call/rosAFE/ildPort/{}".format, texts.map(quote)),
+    st.builds("/load/rosAFE?i={}&as={}".format, texts.map(quote_plus), texts.map(quote_plus)),
+    st.sampled_from(FIXED + [f"/request/{verb}" for verb in ("status", "result", "abort", "clean")]),
+    st.lists(texts.map(lambda text: quote(text, safe="")), max_size=4).map(lambda parts: "/" + "/".join(parts)),
+)
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | texts,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(parameters) | texts, inner, max_size=4),
+    max_leaves=8,
+)
+keys = st.sampled_from(["s", "syntax", "input", "argv", "id", "ack", "oneway", "element", "i", "as", "ms", "dir"])
+queries = st.lists(
+    st.one_of(
+        st.tuples(st.just("input"), values.map(json.dumps) | texts),
+        st.tuples(st.just("syntax"), st.sampled_from(["json", "tcl"])),
+        st.tuples(st.just("id"), st.integers(1, 50).map("rosAFE::{}".format)),
+        st.tuples(keys, texts),
+    ),
+    max_size=4,
+)
+
+
+def test_random_text_is_rejected(world: World) -> None:
+    """The error is named, and genomixd neither crashes nor grows."""
+    connection = http.client.HTTPConnection("127.0.0.1", world.port, timeout=harness.PATIENCE)
+    world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
+
+    @settings(max_examples=100, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
+    @given(paths, queries)
+    def throw(path: str, query: list[tuple[str, str]]) -> None:
+        if path.split("?")[0].split("/")[-1] in ("kill", "listen", "wait"):
+            return
+        text = "&".join(f"{quote_plus(k)}={quote_plus(v, errors='replace')}" for k, v in query)
+        connection.request("GET", f"{path}{'&' if '?' in path else '?'}{text}")
+        response = connection.getresponse()
+        body = response.read()
+        assert response.status in (200, 400, 404, 409, 422, 502, 503), (path, query, response.status, body[:300])
+        if response.status != 200 and "syntax=tcl" not in text:
+            error = json.loads(body)
+            assert error["ex"].startswith("::") and error["ex"] != "::genom::unkex", (path, query, error)
+
+    memory = resident(world.server.pid)
+    throw()
+    connection.close()
+    assert world.server.alive
+    assert "Traceback" not in world.server.err
+    assert world.http.call("bass/Stop") == {}
+    assert open_files(world.server.pid) < 100 + LINKS
+    assert resident(world.server.pid) < memory + 200

@@ -49,24 +49,16 @@ def test_a_zero_is_literal_with_call_and_send(world: World) -> None:
     world.http.wait(world.http.send("rosAFE/PreProc", {"name": "sent", "pp_coefPreEmphasis": 0}), "sent")
     for name, level in (("called", 0.0), ("sent", 100.0)):
         wait_for(functools.partial(is_there, world, name))
-        assert (
-            reported_parameters(world, "preProc", name)["pp_coefPreEmphasis"],
-            reported_parameters(world, "preProc", name)["pp_refSPLdB"],
-        ) == (
-            0.0,
-            level,
-        )
+        found = reported_parameters(world, "preProc", name)
+        assert (found["pp_coefPreEmphasis"], found["pp_refSPLdB"]) == (0.0, level)
 
 
 @pytest.mark.parametrize(
     ("request_name", "given", "why"),
     [
         ("GammatoneProc", {"fb_lowFreqHz": 0}, "fb_lowFreqHz: expected a number above 0, at most 1000000, got 0"),
-        ("GammatoneProc", {"fb_nGamma": 0}, "fb_nGamma: expected a number from 1 to 128, got 0"),
-        ("GammatoneProc", {"fb_nERBs": 0}, "fb_nERBs: expected a number above 0, at most 100, got 0"),
         ("GammatoneProc", {"name": ""}, "name: '' also names a topic"),
         ("InputProc", {"nFramesPerBlock": 0}, "nFramesPerBlock: expected a number from 1 to 10000000, got 0"),
-        ("InputProc", {"bufferSize_s_port": 0}, "bufferSize_s_port: expected a number above 0, at most 600, got 0"),
         ("InputProc", {"name": ""}, "name: expected the name of a processor, got ''"),
     ],
 )
@@ -116,13 +108,8 @@ def test_zeros_of_tcl(world: World) -> None:
         dict for {- one} [dict get [rosAFE::getParameters] parameters preProc] {
             show [dict get $one name] [dict get $one pp_coefPreEmphasis]
         }
-        show [dict get [lindex [failure {rosAFE::GammatoneProc {upperDepName a fb_lowFreqHz 0}}] 0] detail what]
     """
-    assert world.lines(INPUT + script) == [
-        "a|0.0",
-        "b|0.0",
-        "fb_lowFreqHz: expected a number above 0, at most 1000000, got 0",
-    ]
+    assert world.lines(INPUT + script) == ["a|0.0", "b|0.0"]
 
 
 # --- unknown words ----------------------------------------------------------------------------------------------
@@ -233,8 +220,6 @@ def test_matlab_has_the_warning_in_the_request(world: World) -> None:
         r = rosAFE.PreProc('zero', 'input', 0, 20, 0, 0);
         parameters = rosAFE.getParameters().result.parameters;
         show('zero', parameters.preProc{2}.pp_coefPreEmphasis);
-        r = rosAFE.GammatoneProc('none', 'preProc', 'gammatone', 0);
-        show('refused', {r.status, r.exception.detail.what});
     """
     printed = octave.run(world, script)
     shown = octave.values(printed)
@@ -243,16 +228,6 @@ def test_matlab_has_the_warning_in_the_request(world: World) -> None:
     assert shown["sent"] == ["sent", MISSPELT.replace("ihc:", "two:", 1)]
     assert shown["known"] == ""
     assert shown["zero"] == 0
-    assert shown["refused"] == ["error", "fb_lowFreqHz: expected a number above 0, at most 1000000, got 0"]
-
-
-def test_new_kinds_reject_unknown_choices(world: World) -> None:
-    start(world, "PreProc", "GammatoneProc", "IhcProc")
-    with pytest.raises(HttpError) as refused:
-        world.http.call("rosAFE/AutocorrelationProc", {"ac_wname": "han"})
-    assert refused.value.ex == "::rosAFE::e_badNewValue"
-    assert refused.value.what.startswith("ac_wname: expected one of hamming, ")
-    assert refused.value.what.endswith("; did you mean hann?")
 
 
 @pytest.mark.parametrize("by", ["option", "parameter"])

@@ -67,10 +67,6 @@ def test_an_instance_has_names_of_its_own(world: World) -> None:
             world.http.get("/load/rosAFE", i="left")
 
 
-def test_rpath_is_accepted(world: World) -> None:
-    assert world.http.get("/rpath", dir="~/openrobots/lib") == {}
-
-
 # --- functions --------------------------------------------------------------------------------------------------
 
 
@@ -135,18 +131,6 @@ def test_tcl_syntax(world: World) -> None:
 
 
 # --- errors -----------------------------------------------------------------------------------------------------
-
-
-def test_exceptions_of_the_component(world: World) -> None:
-    with pytest.raises(HttpError) as caught:
-        world.http.call("rosAFE/PreProc", {"upperDepName": "nobody"})
-    assert (caught.value.status, caught.value.ex) == (422, "::rosAFE::e_noUpperDependencie")
-    start_tree(world.http)
-    with pytest.raises(HttpError) as caught:
-        world.http.call("rosAFE/GammatoneProc", {"name": "g", "fb_nERBs": -1})
-    assert caught.value.ex == "::rosAFE::e_badNewValue"
-    assert "fb_nERBs" in caught.value.what
-    assert [p["name"] for p in world.http.call("rosAFE/getParameters")["parameters"]["gammatone"]] == ["gammatone"]
 
 
 def test_rejected_arguments_are_not_sent_to_a_component(world: World) -> None:

@@ -15,8 +15,7 @@ from rosafe.interface import BASS, ROSAFE, ComponentError, Service
 from rosafe.ros1.client.component_client import ComponentClient, Value
 from rosafe.ros1.client.graph import Graph
 from rosafe.web.genomix import sessions
-from rosafe.web.genomix.activity_request import REQUEST_BYTES, Request
-from rosafe.web.genomix.sessions import Session, Sessions
+from rosafe.web.genomix.sessions import REQUEST_BYTES, Request, Session, Sessions
 from rosafe.web.genomix.text_formats import JSON
 
 

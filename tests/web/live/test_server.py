@@ -264,7 +264,7 @@ def test_a_step_back_of_the_time_begins_another_series(
     columns: tuple[directions.DirectionTopics, list[tuple[int, int]]],
 ) -> None:
     topics, found = columns
-    for moment in (10.05, 10.15, 10.35, 1.05, 1.15):
+    for moment in (10.05, 10.15, 10.12, 10.35, 1.05, 1.15):  # 10.12: in the column of 10.15
         sources, posterior = pair(moment)
         topics._receive_sources(sources)
         topics._receive_posterior(posterior)

@@ -8,12 +8,14 @@ import socket
 from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Any
-from unittest import mock
+from typing import cast
 
+import numpy as np
+import pytest
 from aiohttp import web
 
-from rosafe.web.server.connections import Connections, Limits
+from rosafe.web.server import connections
+from rosafe.web.server.connections import ClientAccount, Connections, HttpConnection, Limits, _address
 from rosafe.web.server.listener import HttpListener, connection_of
 from rosafe.web.server.refusal import HttpRefusal
 from tests.harness import PATIENCE
@@ -24,7 +26,6 @@ LIMITS = Limits(
     max_header_bytes=2**20,
     max_answers=2**20,
     request_seconds=PATIENCE,
-    idle_seconds=PATIENCE,
 )
 LARGE = bytes(32 * 2**20)  # more than the buffers of the kernel hold
 
@@ -61,9 +62,7 @@ class World:
     """A server with the paths /now, /token (authenticates the connection), /poll and /large."""
 
     def __init__(self, limits: Limits) -> None:
-        self.connections = Connections(
-            limits, lambda refusal: (str(refusal).encode(), "text/plain"), logging.getLogger()
-        )
+        self.connections = Connections(limits, _format, logging.getLogger())
         self.may_answer = asyncio.Event()
         self.polling = asyncio.Semaphore(0)
         app = web.Application(middlewares=[self._guard])
@@ -112,7 +111,7 @@ class World:
 
     async def _large(self, request: web.Request) -> web.StreamResponse:
         data = bytes(request.query.get("other", ""), "ascii") or LARGE
-        with self.connections.reading_answer(connection_of(request), data, len(LARGE)):
+        with self.connections.reading_answer(data, len(LARGE)):
             response = web.StreamResponse()
             response.content_length = len(LARGE)
             await response.prepare(request)
@@ -146,7 +145,108 @@ def test_half_of_the_connections_of_an_address_may_poll() -> None:
     run(check)
 
 
+# --- which connections are closed ----------------------------------------------------------------------------------
+
+
+class Fake:
+    """A connection as `Connections` sees it."""
+
+    def __init__(self, every: Connections) -> None:
+        self.dropped = False
+        self.account = ClientAccount("")
+        self.every = every
+
+    def drop(self) -> None:
+        self.dropped = True
+        self.every.forget(cast(HttpConnection, self))
+
+
+class Room:
+    """A server with room for eight connections, four from one address."""
+
+    def __init__(self) -> None:
+        self.every = Connections(replace(LIMITS, max_connections=8), _format, logging.getLogger())
+
+    def come(self, address: str, busy: bool = False) -> Fake | None:
+        """Return a new connection, None if it is rejected."""
+        new = Fake(self.every)
+        connection = cast(HttpConnection, new)
+        account = self.every.admit(connection, address)
+        if account is None:
+            return None
+        new.account = account
+        if busy:
+            del account.silent[connection]
+        return new
+
+    def authenticate(self, one: Fake | None) -> None:
+        """An authenticated connection waits for its next request."""
+        assert one is not None
+        connection = cast(HttpConnection, one)
+        del one.account.silent[connection]
+        one.account.idle[connection] = None
+
+
+def dropped(connections: list[Fake | None]) -> list[bool]:
+    return [one.dropped for one in connections if one]
+
+
+def test_the_longest_idle_connection_is_closed_first() -> None:
+    server = Room()
+    mine = [server.come("me") for _ in range(2)]
+    crowd = [server.come("crowd", busy=number == 0) for number in range(10)]
+    # Six connections of the crowd were closed, but not the one in use, and none of other clients.
+    assert dropped(crowd) == [False] + [True] * 6 + [False] * 3
+    others = [server.come("other") for _ in range(2)]  # now it is full
+    assert server.come("third") is not None  # one of the client with most connections is closed
+    assert dropped(crowd[7:]) == [True, False, False]
+    assert not any(dropped(mine + others))
+
+
+def test_a_connection_in_use_is_not_closed() -> None:
+    server = Room()
+    assert all(server.come("crowd", busy=True) for _ in range(4))
+    assert server.come("crowd") is None
+    assert all(server.come("more", busy=True) for _ in range(3))
+    last = server.come("more")
+    assert server.come("me") is not None
+    assert last is not None and last.dropped
+    assert server.come("you") is not None  # of the previous one, which waits
+
+
 def test_authenticated_connections_are_closed_last() -> None:
+    """But a full address loses its own ones, even if another address has a connection that is not authenticated."""
+    server = Room()
+    stranger = server.come("other")
+    owner = [server.come("loopback") for _ in range(2)]
+    for one in owner:
+        server.authenticate(one)
+    silent = [server.come("loopback") for _ in range(4)]
+    assert dropped(silent) == [True, True, False, False]
+    for one in silent[2:]:
+        server.authenticate(one)
+    assert dropped(owner) == [False, False]
+    assert server.come("loopback") is not None
+    assert dropped(owner) == [True, False] and dropped([stranger]) == [False]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("127.0.0.1", "127.8.9.10", True),
+        ("127.0.0.1", "::1", True),
+        ("10.0.0.1", "10.0.0.2", False),
+        ("10.0.0.1", "127.0.0.1", False),
+        ("2001:db8::1", "2001:db8::ffff:2", True),
+        ("2001:db8::1", "2001:db8:0:1::1", False),
+        ("fe80::1%eth0", "fe80::1", True),
+    ],
+)
+def test_addresses_of_one_client(one: str, other: str, same: bool) -> None:
+    assert (_address((one, 1)) == _address((other, 2))) is same
+
+
+def test_the_token_authenticates_a_connection() -> None:
     async def check(world: World) -> None:
         authenticated = await world.connect()
         assert await authenticated.get("/token") == 200
@@ -156,25 +256,6 @@ def test_authenticated_connections_are_closed_last() -> None:
         assert await authenticated.get("/now") == 200
 
     run(check)
-
-
-def test_a_full_address_loses_its_own_connections() -> None:
-    """Also if another address has a connection that is not authenticated. All addresses of this machine are one."""
-    connections = Connections(LIMITS, _format, logging.getLogger())
-    dropped: list[str] = []
-
-    def connection(address: str) -> Any:
-        one = mock.Mock(has_unread_data=False, drop=lambda: dropped.append(address))
-        one.account = connections.admit(one, address)
-        return one
-
-    connection("10.0.0.2")
-    for _ in range(8):
-        one = connection("10.0.0.1")
-        one.account.idle[one] = one.account.silent.pop(one)  # authenticated
-    assert not dropped
-    connection("10.0.0.1")
-    assert dropped == ["10.0.0.1"]
 
 
 def test_a_burst_of_requests_does_not_lock_out_other_clients() -> None:
@@ -211,5 +292,65 @@ def test_answers_that_clients_read_slowly_leave_no_memory_for_others() -> None:
         await world.polling.acquire()
         assert [await client.status() for client in (slow, other)] == [200, 200]
         assert await other.get("/large?other=1") == 200
+
+    run(check)
+
+
+def test_a_single_answer_may_be_too_large() -> None:
+    every = Connections(replace(LIMITS, max_answers=100), _format, logging.getLogger())
+    samples = np.zeros(2), np.zeros(2)
+    one, same = (every.reading_answer(samples[0], 1000) for _ in range(2))
+    with one, same, pytest.raises(HttpRefusal, match="clients are reading"), every.reading_answer(samples[1], 1):
+        pass
+    with every.reading_answer(samples[0], 60), every.reading_answer(samples[1], 40):
+        pass
+
+
+# --- time limits ------------------------------------------------------------------------------------------------
+
+
+async def statuses_until_the_end(client: Client) -> list[bytes]:
+    """Return the first lines of all answers until the server closes the connection."""
+    answers = await client.reader.read()
+    return [line.split()[1] for line in answers.splitlines() if line.startswith(b"HTTP/1.1 ")]
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET /now HTTP/1.1\r\nHo", b"GET /now HTTP/1.1\r\nHost: localhost\r\nX: "])
+def test_a_request_without_an_end(sent: bytes) -> None:
+    """At once, or on a connection that was used before and may be idle; the limit applies to the complete request."""
+
+    async def check(world: World) -> None:
+        new, used = await world.connect(), await world.connect()
+        assert await used.get("/now") == 200
+        new.writer.write(sent)
+        slow = asyncio.create_task(byte_by_byte(new)) if sent.endswith(b"X: ") else None
+        assert await statuses_until_the_end(new) == [b"408"]
+        if slow:
+            slow.cancel()
+        if sent:
+            assert await used.get("/now") == 200
+            used.writer.write(sent)
+            assert await statuses_until_the_end(used) == [b"408"]
+
+    run(check, replace(LIMITS, request_seconds=0.5))
+
+
+async def byte_by_byte(client: Client) -> None:
+    while True:
+        client.writer.write(b"x")
+        await asyncio.sleep(0.05)
+
+
+def test_a_client_that_does_not_read_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "STALL_SECONDS", 0.5)
+
+    async def check(world: World) -> None:
+        slow, other = await world.connect(), await world.connect()
+        slow.send("/large")
+        await world.polling.acquire()
+        slow.writer.transport.pause_reading()  # type: ignore[attr-defined]
+        assert await other.get("/large?other=1") == 503
+        while world.connections._answers:
+            await asyncio.sleep(0.01)
 
     run(check)
