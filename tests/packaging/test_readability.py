@@ -156,7 +156,9 @@ def resolves(name: str) -> bool:
     for end in range(len(parts), 0, -1):
         try:
             value: object = importlib.import_module(".".join(parts[:end]))
-        except ModuleNotFoundError:
+        except ModuleNotFoundError as problem:
+            if problem.name == "torch":  # which only `rosafe.torch` needs
+                return True
             continue
         for attribute in parts[end:]:
             if not hasattr(value, attribute):

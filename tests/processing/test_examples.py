@@ -114,8 +114,8 @@ def test_an_example(name: str, folder: Path, tmp_path: Path) -> None:
     if name == "train.py" and not (TORCH / "torch").exists():
         pytest.skip("PyTorch is not here: scripts/install --tests brings it where pip has a build for processors")
     (tmp_path / "sounddevice.py").write_text(SOUNDDEVICE)
-    arguments: list[str | Path] = {"stream_wav.py": [folder / "speech.wav"], "train.py": ["3"]}.get(name, [])
-    said = run(PYTHON, EXAMPLES / name, *arguments, cwd=tmp_path, path=f"{tmp_path}:{TORCH}")
+    arguments: dict[str, list[str | Path]] = {"stream_wav.py": [folder / "speech.wav"], "train.py": ["3"]}
+    said = run(PYTHON, EXAMPLES / name, *arguments.get(name, []), cwd=tmp_path, path=f"{tmp_path}:{TORCH}")
     assert re.search(SAID[name], said), said
     if name == "ratemap.py":
         assert is_picture(tmp_path / "ratemap.png")
