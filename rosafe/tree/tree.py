@@ -10,7 +10,7 @@ from typing import Any
 from rosafe.declarations.parameter import Parameter
 from rosafe.declarations.text import did_you_mean, join_names, short_repr
 from rosafe.dsp.signal_format import SignalFormat
-from rosafe.interface import KINDS, ROSAFE, ComponentError
+from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
 from rosafe.tree.block import Source
 from rosafe.tree.context import Observer, TreeContext, TreeListener
@@ -34,17 +34,25 @@ class Tree:
         Is notified of every block and every removal.
     workers, real_time : int (optional), bool
         See `Workers`; by default as many as `workers_to_use` returns, which raises ValueError beyond its limits.
+
+    Attributes
+    ----------
+    lock : threading.RLock
+        Held by each request. A caller that holds it makes several requests as one.
+    input_values : dict
+        The parameters of the input's request, by their names in the interface: its block and its buffers.
     """
 
     def __init__(self, listener: TreeListener, workers: int | None = None, real_time: bool = False) -> None:
         self._registry = ProcessorRegistry()
         self._lock = threading.RLock()  # guards all tokens
-        self._requests = threading.RLock()  # one request at a time; acquired before _lock
+        self.lock = threading.RLock()  # acquired before _lock
         self._workers = Workers(self._lock, workers_to_use(workers), real_time)
         self._context = TreeContext(self._workers, listener, self.end, threading.Condition(self._lock))
         self.wait_idle = self._workers.wait_idle
         self.sample_rate = 0.0
         self.port_seconds = self.history_seconds = 1.0
+        self.input_values: dict[str, Any] = {}
 
     # --- queries ---
 
@@ -56,29 +64,29 @@ class Tree:
     @property
     def processors(self) -> list[Processor]:
         """All processors in the order of their creation."""
-        with self._requests:
+        with self.lock:
             return list(self._registry.by_name.values())
 
     @property
     def input(self) -> Processor | None:
         """The root, if there is one."""
-        with self._requests:
+        with self.lock:
             return self._registry.root
 
     @property
     def failures(self) -> list[Failure]:
         """The processors that failed, oldest first, without those that were created again."""
-        with self._requests:
+        with self.lock:
             return list(self._registry.failures.values())
 
     def find(self, name: str) -> Processor:
         """Return the processor called `name`. Raises e_noSuchProcessor."""
-        with self._requests:
+        with self.lock:
             return self._registry.find(name)
 
     def dependencies(self, name: str) -> list[str]:
         """Return the names from the input down to `name`."""
-        with self._requests:
+        with self.lock:
             chain = [self.find(name)]
             while (parent := chain[-1].parent) is not None:
                 chain.append(parent)
@@ -86,7 +94,7 @@ class Tree:
 
     def observe(self, observer: Observer) -> Callable[[], None]:
         """Call `observer` with each processor's state, now and after each change; return a function that ends this."""
-        with self._requests, self._lock:
+        with self.lock, self._lock:
             for processor in self._registry.by_name.values():
                 observer(processor, processor.state, None)
             self._context.observers.append(observer)
@@ -101,7 +109,7 @@ class Tree:
 
     def check_input(self, name: str, sample_rate: float) -> None:
         """Raise ComponentError if no input can start now. It may replace the present one."""
-        with self._requests:
+        with self.lock:
             holder = self._registry.by_name.get(name)
             if holder is not None and holder.parent is not None:
                 raise already_exists(holder)
@@ -125,7 +133,8 @@ class Tree:
         Histories are raised to two blocks, as the original intended. A tree whose source has ended is removed. If the
         input is rejected, `source` is stopped. Plugins, and processors that compare ears, require `ears` to be 2.
         """
-        with self._requests:
+        with self.lock:
+            requested = (frames_per_block, port_seconds, history_seconds)
             history_seconds = max(history_seconds, 2 * frames_per_block / source.sample_rate)
             old = self.input
             try:
@@ -140,6 +149,7 @@ class Tree:
                 raise
             self.sample_rate = source.sample_rate
             self.port_seconds, self.history_seconds = port_seconds, history_seconds
+            self.input_values = {p.name: value for p, value in zip(BLOCK_AND_BUFFERS, requested, strict=True)}
             if old is not None:
                 self._replace(old, new)
             else:
@@ -160,12 +170,12 @@ class Tree:
 
     def check(self, kind: str, name: str, parent_name: str) -> Processor:
         """Return the parent of a processor that can be added now. Raises ComponentError in the original's order."""
-        with self._requests:
+        with self.lock:
             return self._registry.find_parent(kind, name, parent_name)
 
     def add(self, kind: str, name: str, parent_name: str, parameters: Mapping[str, Any] | None = None) -> Processor:
         """Add a processor of `kind` below `parent_name`. It is running when this returns."""
-        with self._requests:
+        with self.lock:
             parent = self.check(kind, name, parent_name)
             with _bad_new_value():
                 stage = STAGES[kind](parent.signal, **(parameters or {}))
@@ -206,7 +216,7 @@ class Tree:
 
         `resolve(parameter, value)` returns the value to use for a value that may be an unknown choice.
         """
-        with self._requests:
+        with self.lock:
             processor = self.find(name)
             parameter = _find_parameter(processor, parameter_name)
             with _bad_new_value():
@@ -218,7 +228,7 @@ class Tree:
 
         The blocks of successive calls ascend: each change is checked after all previous ones.
         """
-        with self._requests, _bad_new_value():
+        with self.lock, _bad_new_value():
             for processor in self._registry.by_name.values():
                 if any(parameter_name == p.name for p in processor.representation.parameters):
                     self._change(processor, parameter_name, value, block)
@@ -236,7 +246,7 @@ class Tree:
 
     def remove(self, name: str) -> list[Processor]:
         """Remove a processor and its descendants, leaves first, and return them."""
-        with self._requests:
+        with self.lock:
             processor = self.find(name)
             if processor.parent is None:
                 raise ROSAFE.error("e_noSuchProcessor", f"{name!r} is the input, which cannot be removed: call Stop")
@@ -244,7 +254,7 @@ class Tree:
 
     def end(self, processor: Processor) -> None:
         """Remove `processor`, which may be the input, and its descendants, if it is still in the tree."""
-        with self._requests:
+        with self.lock:
             if self._registry.by_name.get(processor.name) is processor:
                 if processor.error is not None:
                     self._registry.record_failure(processor)
@@ -259,7 +269,7 @@ class Tree:
 
     def stop(self) -> None:
         """Remove all processors. Each worker may still compute a block, whose result is discarded."""
-        with self._requests:
+        with self.lock:
             if (root := self.input) is not None:
                 self._remove(root)
 

@@ -162,5 +162,5 @@ def end(tree: Tree, listener: Recorder) -> None:
     for processor in listener.processors:
         assert processor.join(PATIENCE), f"{processor!r} is still running"
     tree.join()
-    assert tree_threads() == set()
+    assert not tree_threads(), tree_threads()
     assert listener.late == []

@@ -8,7 +8,7 @@ from typing import Any
 
 from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError
 from rosafe.ros1.afe.choice_fallbacks import ChoiceFallbacks
-from rosafe.ros1.afe.ports import OutputPort, OutputPorts, element
+from rosafe.ros1.afe.ports import OutputPort, OutputPorts
 from rosafe.ros1.afe.processor_health import ProcessorHealth
 from rosafe.ros1.component import serialization
 from rosafe.ros1.component.activities import Activity
@@ -141,7 +141,7 @@ class PublishedTree:
 
     def _advertise(self, kind: str, name: str = "") -> Publisher:
         message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
-        publisher = self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
+        publisher = self._node.advertise(KINDS[kind].port, message_class, name)
         publisher.impl.on_connection = self._catch_up
         publisher.impl.on_subscribers_changed = self._ports.forget_subscribed
         return publisher

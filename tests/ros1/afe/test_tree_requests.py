@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+from rosafe.setups import read
 from tests.harness import Graph, run_together
 from tests.ros1.afe.session import RATE, Microphone, Session, noise, own_node
 
@@ -165,6 +166,46 @@ def test_unknown_representations(afe: Session) -> None:
     ex, what = why(afe, representation="pich")
     assert ex == "::rosAFE::e_badNewValue" and "pitch" in what and "did you mean pitch?" in what
     assert why(afe)[0] == ex
+
+
+def test_find_and_remove_unused(afe: Session) -> None:
+    sounding(afe)
+    assert afe.refused("find", representation="time")[0] == "::rosAFE::e_noSuchProcessor"
+    created = afe.ok("request", representation="ild", parameters=f"{BLOCK}, fb_nChannels: 4").created
+    found = afe.ok("find", representation="ild", parameters="fb_nChannels: 4")
+    assert (found.reused, found.created, found.topic) == (created, [], f"/{afe.name}/ildPort/ild_0")
+    afe.ok("PreProc", name="mine", upperDepName="input_0")
+    assert afe.ok("removeUnused", names=created).removed == created[:0:-1]
+    assert tree(afe) == {"input_0": "", "mine": "input_0"}
+    afe.wait_activities(["InputProc", "PreProc"])
+
+
+def test_a_setup_is_built_by_the_node_completely_or_not_at_all(graph: Graph) -> None:
+    """It connects the port; if a processor is refused, the previous topic is connected again."""
+    with own_node(graph, name="loading") as afe:
+        first, second = Microphone(graph), Microphone(graph, sample_rate=20000)
+        text = "processors:\n  input: {kind: input, nFramesPerBlock: 1600}\n  preProc: {kind: preProc}\n"
+        bank = "  bank: {kind: gammatone, parent: preProc, fb_highFreqHz: 9000}\n"
+        for microphone in (first, second):
+            microphone.play(noise(400))
+        setup = f"connections: {{Audio: {first.topic}}}\n{text}"
+        assert afe.ok("loadSetup", setup=setup, check=True).created == ["input", "preProc"]
+        assert (tree(afe), read(afe.ok("saveSetup").setup).connections) == ({}, {})
+        assert afe.ok("loadSetup", setup=setup).created == ["input", "preProc"]
+        assert afe.ok("loadSetup", setup=setup).reused == ["input", "preProc"]
+        assert read(afe.ok("saveSetup").setup).processors == read(text).processors
+        other = setup.replace(first.topic, second.topic)
+        ex, detail = afe.refused("loadSetup", setup=other)
+        assert ex == "::rosAFE::e_existsAlready" and f"the tree is connected to {first.topic}" in detail["what"]
+        afe.ok("Stop")
+        assert afe.refused("loadSetup", setup=f"{other}{bank.replace('9000', '15000')}")[0] == "::rosAFE::e_badNewValue"
+        saved = read(afe.ok("saveSetup", full=True).setup)
+        assert (saved.processors, dict(saved.connections)) == ((), {"Audio": first.topic.removeprefix("/")})
+        assert afe.ok("loadSetup", setup=f"{other}{bank}").created == ["input", "preProc", "bank"]
+        afe.wait_activities(["InputProc", "PreProc", "GammatoneProc"])
+        assert "line 2" in afe.refused("loadSetup", setup="processors:\n  a: {kind: x}")[1]["what"]
+        first.close()
+        second.close()
 
 
 def test_the_same_tree_at_the_same_time(afe: Session) -> None:
