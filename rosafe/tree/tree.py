@@ -5,20 +5,29 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 from rosafe.declarations.parameter import Parameter
 from rosafe.declarations.text import did_you_mean, join_names, short_repr
 from rosafe.dsp.signal_format import SignalFormat
+from rosafe.dsp.stage import Stage
 from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
+from rosafe.tree import sizes
 from rosafe.tree.block import Source
-from rosafe.tree.context import Observer, TreeContext, TreeListener
-from rosafe.tree.processor import Processor, subtree
+from rosafe.tree.processor import Observer, Processor, TreeContext, TreeListener, subtree
 from rosafe.tree.processor_registry import Failure, ProcessorRegistry, already_exists
 from rosafe.tree.states import State
-from rosafe.tree.subtree_preview import ProcessorPreview, check_memory, preview_subtree
 from rosafe.tree.workers import Workers, workers_to_use
+
+
+class ProcessorPreview(NamedTuple):
+    """A processor with the stage, and the leading shape of its input, that it would have after a request."""
+
+    processor: Processor
+    stage: Stage
+    rows: sizes.Rows
+
 
 INPUT = next(kind for kind, representation in KINDS.items() if not representation.parent)
 
@@ -143,7 +152,7 @@ class Tree:
                     stage = STAGES[INPUT](SignalFormat.sound(source.sample_rate, ears), **(parameters or {}))
                     new = Processor(name, stage, None, history_seconds, port_seconds, self._context, source)
                     root_after = old if old is not None and old.state is not State.DONE else new
-                    self._check_memory(preview_subtree(root_after, stage), old, max(port_seconds, history_seconds))
+                    self._check_memory(_preview_subtree(root_after, stage), old, max(port_seconds, history_seconds))
             except ComponentError:
                 source.stop()
                 raise
@@ -180,7 +189,7 @@ class Tree:
             with _bad_new_value():
                 stage = STAGES[kind](parent.signal, **(parameters or {}))
                 processor = Processor(name, stage, parent, self.history_seconds, self.port_seconds, self._context)
-                self._check_memory(preview_subtree(processor, stage))
+                self._check_memory(_preview_subtree(processor, stage))
             self._start(processor)
             return processor
 
@@ -197,11 +206,15 @@ class Tree:
         self, previews: list[ProcessorPreview], replaced: Processor | None = None, seconds: float | None = None
     ) -> None:
         """Raise ValueError if the previewed processors, instead of the subtree of `replaced`, need too much memory."""
-        if seconds is None:
-            seconds = max(self.port_seconds, self.history_seconds)  # both refer to the same blocks
+        limit = max(self.port_seconds, self.history_seconds) if seconds is None else seconds  # of the same blocks
         without = set(subtree(replaced)) if replaced is not None else set()
-        others = [processor for processor in self._registry.by_name.values() if processor not in without]
-        check_memory(previews, others, seconds)
+        for _, stage, rows in previews:
+            sizes.check_stage(stage, rows, limit)
+        taken = [sizes.total_size(stage, rows, limit) for _, stage, rows in previews]
+        for other in list(self._registry.by_name.values()):
+            if other not in without:
+                taken.append(other.ask(lambda one: sizes.total_size(one.stage, one.input_shape, limit)) or 0.0)
+        sizes.check_all(taken, limit)
 
     # --- change parameters ---
 
@@ -236,7 +249,7 @@ class Tree:
     def _change(self, processor: Processor, name: str, value: Any, block: int = 0) -> None:
         """Change a parameter. If a descendant rejects the change, raise ValueError and change nothing."""
         changed = processor.changes.preview(name, value)
-        previews = preview_subtree(processor, changed)
+        previews = _preview_subtree(processor, changed)
         self._check_memory(previews, replaced=processor)
         for one, stage, _ in previews:
             one.changes.final_stage = stage
@@ -283,6 +296,31 @@ class Tree:
             one.end()
             del self._registry.by_name[one.name]
         return removed
+
+
+def _preview_subtree(processor: Processor, stage: Stage) -> list[ProcessorPreview]:
+    """Return the preview of `processor` with `stage`, and those of its descendants.
+
+    Raises ValueError if one of them rejects the request.
+    """
+    parent_stage = None if processor.parent is None else processor.parent.stage
+    return list(_previews(processor, stage, processor.input_shape, parent_stage))
+
+
+def _previews(
+    processor: Processor, stage: Stage, rows: sizes.Rows, parent_stage: Stage | None
+) -> Iterator[ProcessorPreview]:
+    extra = stage.required_extra
+    if parent_stage is not None and extra and extra not in parent_stage.EXTRAS:
+        raise ValueError(f"{processor.kind} needs the {extra} of {parent_stage.REPRESENTATION}, which has none")
+    yield ProcessorPreview(processor, stage, rows)
+
+    def preview_child(child: Processor) -> list[ProcessorPreview]:
+        changed = child.changes.preview_input(stage.output_format)
+        return list(_previews(child, changed, stage.output_rows(rows), stage))
+
+    for child in list(processor.children):
+        yield from child.ask(preview_child) or ()
 
 
 def _find_parameter(processor: Processor, name: str) -> Parameter:
