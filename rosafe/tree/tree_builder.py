@@ -90,7 +90,7 @@ class TreeBuilder:
         return _result(request, found)
 
     def build(self, plan: Planner, open_input: OpenInput, plugins: bool = False) -> TreePlan:
-        """Execute what `plan` returns for the existing processors, completely or not at all, and return it.
+        """Return the plan for the existing processors after it has been executed, completely or not at all.
 
         `plan` is called under the tree's lock, again after the sound of a new input has arrived. With `plugins`, the
         first blocks of the created processors are awaited.

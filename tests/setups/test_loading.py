@@ -226,7 +226,7 @@ def test_a_rejected_sound_or_tree_leaves_nothing() -> None:
 
 @pytest.mark.parametrize("service", ["loadSetup", "request"])
 def test_a_cancelled_request_leaves_nothing(service: str) -> None:
-    """Also if the cleanup is cancelled again: the node completes a request although nobody waits for the answer."""
+    """Also if the cleanup is cancelled again: the node completes a request although its client no longer waits."""
 
     async def cancelled(steps: int, again: int) -> Graph:
         graph = Graph()
