@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from rosafe.declarations.parameter import Parameter
 from rosafe.declarations.text import did_you_mean, join_names, short_repr
+from rosafe.dsp.plugin_checks import PluginError
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, ROSAFE, ComponentError
@@ -16,9 +17,31 @@ from rosafe.representations import STAGES
 from rosafe.tree import sizes
 from rosafe.tree.block import Source
 from rosafe.tree.processor import Observer, Processor, TreeContext, TreeListener, subtree
-from rosafe.tree.processor_registry import Failure, ProcessorRegistry, already_exists
 from rosafe.tree.states import State
 from rosafe.tree.workers import Workers, workers_to_use
+
+MAX_FAILURES = 20  # that are kept
+
+
+class Failure(NamedTuple):
+    """The failure of a processor. `children` are its descendants, which were removed with it."""
+
+    name: str
+    kind: str
+    reason: str
+    children: tuple[str, ...]
+
+    @classmethod
+    def of(cls, processor: Processor) -> Failure:
+        """Return the failure of a processor whose `error` is set and which is still in the tree."""
+        error = processor.error
+        reason = str(error) if isinstance(error, PluginError) else f"{type(error).__name__}: {error}"
+        below = tuple(one.name for one in subtree(processor) if one is not processor)
+        return cls(processor.name, processor.kind, " ".join(reason.split()), below)
+
+    def __str__(self) -> str:
+        below = f"; ended with it: {', '.join(self.children)}" if self.children else ""
+        return f"{self.name} ({self.kind}) failed: {self.reason}{below}"
 
 
 class ProcessorPreview(NamedTuple):
@@ -53,7 +76,8 @@ class Tree:
     """
 
     def __init__(self, listener: TreeListener, workers: int | None = None, real_time: bool = False) -> None:
-        self._registry = ProcessorRegistry()
+        self._by_name: dict[str, Processor] = {}  # in the order of creation, in which getParameters reports them
+        self._failures: dict[str, Failure] = {}  # oldest first, without processors that were created again
         self._lock = threading.RLock()  # guards all tokens
         self.lock = threading.RLock()  # acquired before _lock
         self._workers = Workers(self._lock, workers_to_use(workers), real_time)
@@ -74,24 +98,30 @@ class Tree:
     def processors(self) -> list[Processor]:
         """All processors in the order of their creation."""
         with self.lock:
-            return list(self._registry.by_name.values())
+            return list(self._by_name.values())
 
     @property
     def input(self) -> Processor | None:
         """The root, if there is one."""
         with self.lock:
-            return self._registry.root
+            return next((p for p in self._by_name.values() if p.parent is None), None)
 
     @property
     def failures(self) -> list[Failure]:
         """The processors that failed, oldest first, without those that were created again."""
         with self.lock:
-            return list(self._registry.failures.values())
+            return list(self._failures.values())
 
     def find(self, name: str) -> Processor:
         """Return the processor called `name`. Raises e_noSuchProcessor."""
         with self.lock:
-            return self._registry.find(name)
+            if name not in self._by_name:
+                raise ROSAFE.error("e_noSuchProcessor", self._missing(name))
+            return self._by_name[name]
+
+    def _missing(self, name: str) -> str:
+        reason = f": {self._failures[name]}" if name in self._failures else ""
+        return f"there is no processor {short_repr(name)}{reason}; there are: {join_names(self._by_name)}"
 
     def dependencies(self, name: str) -> list[str]:
         """Return the names from the input down to `name`."""
@@ -104,7 +134,7 @@ class Tree:
     def observe(self, observer: Observer) -> Callable[[], None]:
         """Call `observer` with each processor's state, now and after each change; return a function that ends this."""
         with self.lock, self._lock:
-            for processor in self._registry.by_name.values():
+            for processor in self._by_name.values():
                 observer(processor, processor.state, None)
             self._context.observers.append(observer)
 
@@ -119,9 +149,9 @@ class Tree:
     def check_input(self, name: str, sample_rate: float) -> None:
         """Raise ComponentError if no input can start now. It may replace the present one."""
         with self.lock:
-            holder = self._registry.by_name.get(name)
+            holder = self._by_name.get(name)
             if holder is not None and holder.parent is not None:
-                raise already_exists(holder)
+                raise _already_exists(holder)
             root = self.input
             if root is not None and root.children and sample_rate != self.sample_rate:
                 rates = f"the tree runs at {self.sample_rate:g} Hz, Audio is at {sample_rate:g} Hz"
@@ -162,7 +192,7 @@ class Tree:
             if old is not None:
                 self._replace(old, new)
             else:
-                self._registry.failures.clear()
+                self._failures.clear()
             self._start(new)
             return new
 
@@ -173,14 +203,28 @@ class Tree:
                 for child in list(old.children):
                     child.move(new)
         self._remove(old)
-        for processor in self._registry.by_name.values():
+        for processor in self._by_name.values():
             processor.history.seconds, processor.history.port_seconds = self.history_seconds, self.port_seconds
-        self._registry.by_name = {new.name: new, **self._registry.by_name}
+        self._by_name = {new.name: new, **self._by_name}
 
     def check(self, kind: str, name: str, parent_name: str) -> Processor:
-        """Return the parent of a processor that can be added now. Raises ComponentError in the original's order."""
+        """Return the parent of a processor that can be added now. Raises ComponentError in the original's order.
+
+        ``e_noUpperDependencie`` if the parent is missing or of the wrong kind; ``e_existsAlready`` if `name` is in use.
+        """
+        expected = KINDS[kind].parent
         with self.lock:
-            return self._registry.find_parent(kind, name, parent_name)
+            names = join_names([p.name for p in self._by_name.values() if p.kind == expected])
+            known = f"; of kind {expected}: {names}"
+            parent = self._by_name.get(parent_name)
+            if parent is None:
+                raise ROSAFE.error("e_noUpperDependencie", f"{self._missing(parent_name)}{known}")
+            if name in self._by_name:
+                raise _already_exists(self._by_name[name])
+            if parent.kind != expected:
+                text = f"expected a processor of kind {expected}, got kind {parent.kind}{known}"
+                raise ROSAFE.error("e_noUpperDependencie", f"{short_repr(parent_name)}: {text}")
+            return parent
 
     def add(self, kind: str, name: str, parent_name: str, parameters: Mapping[str, Any] | None = None) -> Processor:
         """Add a processor of `kind` below `parent_name`. It is running when this returns."""
@@ -194,7 +238,8 @@ class Tree:
             return processor
 
     def _start(self, processor: Processor) -> None:
-        self._registry.add(processor)
+        self._by_name[processor.name] = processor
+        self._failures.pop(processor.name, None)
         try:
             self._context.listener.on_added(processor)
             processor.start()
@@ -211,7 +256,7 @@ class Tree:
         for _, stage, rows in previews:
             sizes.check_stage(stage, rows, limit)
         taken = [sizes.total_size(stage, rows, limit) for _, stage, rows in previews]
-        for other in list(self._registry.by_name.values()):
+        for other in list(self._by_name.values()):
             if other not in without:
                 taken.append(other.ask(lambda one: sizes.total_size(one.stage, one.input_shape, limit)) or 0.0)
         sizes.check_all(taken, limit)
@@ -242,7 +287,7 @@ class Tree:
         The blocks of successive calls ascend: each change is checked after all previous ones.
         """
         with self.lock, _bad_new_value():
-            for processor in self._registry.by_name.values():
+            for processor in self._by_name.values():
                 if any(parameter_name == p.name for p in processor.representation.parameters):
                     self._change(processor, parameter_name, value, block)
 
@@ -268,9 +313,11 @@ class Tree:
     def end(self, processor: Processor) -> None:
         """Remove `processor`, which may be the input, and its descendants, if it is still in the tree."""
         with self.lock:
-            if self._registry.by_name.get(processor.name) is processor:
+            if self._by_name.get(processor.name) is processor:
                 if processor.error is not None:
-                    self._registry.record_failure(processor)
+                    self._failures[processor.name] = Failure.of(processor)
+                    for name in list(self._failures)[:-MAX_FAILURES]:
+                        del self._failures[name]
                 self._remove(processor)
 
     def skip(self, processor: Processor, block: int) -> None:
@@ -294,8 +341,13 @@ class Tree:
         removed = list(subtree(processor))
         for one in removed:  # a worker may still compute a long block of it: this is not waited for
             one.end()
-            del self._registry.by_name[one.name]
+            del self._by_name[one.name]
         return removed
+
+
+def _already_exists(processor: Processor) -> ComponentError:
+    """Return the error of a request to add a processor with the name of an existing one."""
+    return ROSAFE.error("e_existsAlready", f"{short_repr(processor.name)} exists already, of kind {processor.kind}")
 
 
 def _preview_subtree(processor: Processor, stage: Stage) -> list[ProcessorPreview]:

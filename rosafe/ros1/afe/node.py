@@ -23,13 +23,12 @@ from rosafe.interface import KINDS, REQUEST, ROSAFE, ComponentError, Representat
 from rosafe.representations import PLUGINS, PROBLEMS, STAGES, WARNINGS
 from rosafe.ros1.afe import responses
 from rosafe.ros1.afe.audio_input import FIRST_AUDIO_SECONDS, AudioInput
-from rosafe.ros1.afe.choice_fallbacks import ChoiceFallbacks
+from rosafe.ros1.afe.processor_health import ChoiceFallbacks
 from rosafe.ros1.afe.published_tree import PublishedTree
 from rosafe.ros1.afe.saved_tree import SavedTree
 from rosafe.ros1.afe.trace_port import TracePort
 from rosafe.ros1.component import serialization
 from rosafe.ros1.component.activities import Activity, Handler
-from rosafe.ros1.component.audio import AudioReader
 from rosafe.ros1.component.component import ComponentNode
 from rosafe.ros1.component.startup import run_server
 from rosafe.setups import Setup, SetupError, dry_run, plan, read, read_parameters, setup_processor, write
@@ -151,7 +150,11 @@ class RosafeNode:
         self, activity: Activity, frames: int, create: Callable[[Source], Processor | None], seconds: float = 0.0
     ) -> None:
         """Wait for sound, and run the input that `create` adds to the tree; it may return None instead."""
-        reader = self._open_reader(activity, frames, seconds)
+        reader = self._audio.open_reader(frames, activity.stop_requested.is_set, max(seconds, FIRST_AUDIO_SECONDS))
+        if reader is None:
+            activity.raise_if_interrupted()
+            raise ROSAFE.error("e_noData", f"no audio from {self._audio.topic}: is bass acquiring?")
+        reader.next_output = self._published.next_output
         try:
             activity.raise_if_interrupted()
             processor = create(reader)
@@ -162,14 +165,6 @@ class RosafeNode:
             self._saved.discard()
             activity.interrupt_others()
             self._published.run(activity, processor, self._saved.save)
-
-    def _open_reader(self, activity: Activity, frames: int, seconds: float) -> AudioReader:
-        reader = self._audio.open_reader(frames, activity.stop_requested.is_set, max(seconds, FIRST_AUDIO_SECONDS))
-        if reader is None:
-            activity.raise_if_interrupted()
-            raise ROSAFE.error("e_noData", f"no audio from {self._audio.topic}: is bass acquiring?")
-        reader.next_output = self._published.next_output
-        return reader
 
     def _check_creation(self, kind: Representation, values: dict[str, Any]) -> dict[str, Any]:
         """Check, in the original's order, that the parent exists, the name is free, and the parent's kind is right."""
