@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import json
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -178,6 +178,9 @@ class Graph:
             self.created += names
         await asyncio.sleep(0)
         return {"created": names, "reused": []}
+
+    async def check_plugins(self, requests: Iterable[str]) -> None:
+        await asyncio.sleep(0)
 
     async def port_connected(self, port: str) -> str:
         return "/bass/Audio"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -254,10 +254,14 @@ class ComponentClient:
     async def start(self, service: Service, values: Mapping[str, Any]) -> Goal:
         """Start an activity; the state of its goal reports when it runs and when it has ended."""
         with self._count_pending():
-            if service.name in {KINDS[kind].request for kind in PLUGINS}:
-                await self._client(service.name).check()  # the node may not have the plugin, or another version of it
+            await self.check_plugins([service.name])
             await self._watch()
             return await (await self._action(service.name)).send(values)
+
+    async def check_plugins(self, requests: Iterable[str]) -> None:
+        """Raise ComponentError if the node has not the same version of a plugin that has one of these `requests`."""
+        for request in {KINDS[kind].request for kind in PLUGINS}.intersection(requests):
+            await self._client(request).check()
 
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """Call a service and return its outputs."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator, Awaitable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
@@ -13,6 +13,7 @@ from rosafe.declarations import ros_names
 from rosafe.interface import BASS, FIND, LOAD_SETUP, MAX_SEQUENCE, REQUEST, ROSAFE, SAVE_SETUP, ComponentError
 from rosafe.ros1.client.errors import middleware_error
 from rosafe.setups import AcquireSettings, Setup, read, write
+from rosafe.tree.tree_planner import ancestor_kinds, kind_of
 
 AUDIO = "Audio"
 SOUND_SECONDS = 10.0  # from Acquire to the first audio; a sound card takes a second or two
@@ -40,6 +41,9 @@ class Rosafe(Services, Protocol):
     async def published(self, topic: str) -> bool:
         """Return whether `topic` is published."""
 
+    async def check_plugins(self, requests: Iterable[str]) -> None:
+        """Raise ComponentError if the node has not the same version of a plugin that has one of these `requests`."""
+
     def other(self, node: str) -> AbstractAsyncContextManager[Services]:
         """Return another component of the graph by its full name; ComponentError if there is none."""
 
@@ -54,6 +58,7 @@ async def call(component: Rosafe, service: str, values: Mapping[str, Any]) -> Ma
         return {"setup": await save(component, bool(values["full"]))}
     if service == LOAD_SETUP.name:
         return await load(component, values["setup"])
+    await component.check_plugins(kind.request for kind in ancestor_kinds(kind_of(values["representation"])))
     parameters = {name: value for name, value in values.items() if name not in ("representation", "connect")}
     request = {
         "representation": values["representation"],
