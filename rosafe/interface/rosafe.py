@@ -220,7 +220,6 @@ def _ros_services(composites: tuple[Service, ...]) -> tuple[Service, ...]:
             parameters=(
                 *load.parameters,
                 Parameter("check", "boolean", False, "Flag to change nothing, and to return what would be created"),
-                Parameter("wait", "double", 0.0, "Seconds to wait for sound; at least one", 0.0, 60.0, unit="s"),
             ),
             outputs=load.outputs[:2],
         ),

@@ -103,7 +103,7 @@ DEFAULTS = {
     "request": [interface.REQUIRED, "", ""],
     "find": [interface.REQUIRED, "", ""],
     "saveSetup": [False],
-    "loadSetup": [interface.REQUIRED, False, 0.0],
+    "loadSetup": [interface.REQUIRED, False],
     "removeUnused": [()],
     "Acquire": ["hw:1,0", 44100, 2205, 20],
     "DedicatedSocket": [],

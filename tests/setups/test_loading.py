@@ -158,10 +158,14 @@ class Graph:
         self.bass = Bass()
         self.created: list[str] = []
         self.calls: list[dict[str, Any]] = []
+        self.connected = "/bass/Audio"
+        self.silent = 0  # attempts without sound
         self._fail = fail
 
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        raise AssertionError(service)
+        assert service == "connect_port"
+        self.connected = values["remote"]
+        return {}
 
     async def node_outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         await asyncio.sleep(0)
@@ -175,7 +179,11 @@ class Graph:
             return {"removed": values["names"]}
         names = NAMES[self.created == NAMES :] if service == "loadSetup" else ["input_0"]
         if not values.get("check"):
+            self.silent -= 1
+            if self.silent >= 0:
+                raise ROSAFE.error("e_noData")
             self.created += names
+            self.connected = "/bass/Audio"
         await asyncio.sleep(0)
         return {"created": names, "reused": []}
 
@@ -183,7 +191,7 @@ class Graph:
         await asyncio.sleep(0)
 
     async def port_connected(self, port: str) -> str:
-        return "/bass/Audio"
+        return self.connected
 
     async def published(self, topic: str) -> bool:
         return True
@@ -207,11 +215,22 @@ def rejected(graph: Graph, text: str) -> ComponentError:
 def test_the_sound_is_started_or_reused_and_saved() -> None:
     graph = Graph()
     assert asyncio.run(whole_trees.load(graph, SETUP)) == {"created": NAMES, "reused": [], "sound": "started"}
-    assert [(call["check"], call["wait"]) for call in graph.calls] == [(True, 0.0), (False, 10.0)]
+    assert [call["check"] for call in graph.calls] == [True, False]
     assert graph.bass.acquired["nFramesPerChunk"] == 441
     assert asyncio.run(whole_trees.load(graph, SETUP))["sound"] == "reused"
     setup = read(asyncio.run(whole_trees.save(graph, False)))
     assert (setup.sound, dict(setup.connections)) == (read(SETUP).sound, {"Audio": "bass/Audio"})
+
+
+def test_the_sound_may_arrive_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = Graph()
+    graph.silent = 2
+    assert asyncio.run(whole_trees.load(graph, SETUP))["created"] == NAMES
+    graph = Graph()
+    graph.silent = 1000
+    monkeypatch.setattr(whole_trees, "SOUND_SECONDS", 0.3)
+    assert rejected(graph, SETUP).ex == "::rosAFE::e_noData"
+    assert graph.silent < 999
 
 
 def test_a_rejected_sound_or_tree_leaves_nothing() -> None:
@@ -233,6 +252,7 @@ def test_a_cancelled_request_leaves_nothing(service: str) -> None:
 
     async def cancelled(steps: int, again: int) -> Graph:
         graph = Graph()
+        graph.connected = "/left/Audio"
         values = {"setup": SETUP} if service == "loadSetup" else {"representation": "input", "connect": "x"}
         task = asyncio.create_task(whole_trees.call(graph, service, values))
         for wait in (steps, again):
@@ -247,6 +267,7 @@ def test_a_cancelled_request_leaves_nothing(service: str) -> None:
         for again in (1, 3):
             graph = asyncio.run(cancelled(steps, again))
             assert (graph.created, graph.bass.acquired) == ([], {}), (steps, again)
+            assert graph.connected == "/left/Audio" or service == "request"
 
 
 def test_the_request_in_its_form_as_a_ros_service() -> None:

@@ -62,11 +62,11 @@ class AudioInput:
             tcp_nodelay=True,
         )
 
-    def open_reader(self, frames_per_block: int, interrupted: Callable[[], bool], seconds: float) -> AudioReader | None:
+    def open_reader(self, frames_per_block: int, interrupted: Callable[[], bool]) -> AudioReader | None:
         """Return a reader that starts with the next frame; None if there is no audio, or if `interrupted()`."""
         if not self.topic:
             raise ROSAFE.error("e_noData", "the Audio port is not connected: call connect_port first")
-        return self.ring.open_reader(frames_per_block, seconds, interrupted)
+        return self.ring.open_reader(frames_per_block, FIRST_AUDIO_SECONDS, interrupted)
 
     def report(self, status: Any, tree: Tree) -> Any:
         """Fill in a status of /diagnostics."""

@@ -22,7 +22,7 @@ from rosafe.dsp import kernels
 from rosafe.interface import KINDS, REQUEST, ROSAFE, ComponentError, Representation
 from rosafe.representations import PLUGINS, PROBLEMS, STAGES, WARNINGS
 from rosafe.ros1.afe import responses
-from rosafe.ros1.afe.audio_input import FIRST_AUDIO_SECONDS, AudioInput
+from rosafe.ros1.afe.audio_input import AudioInput
 from rosafe.ros1.afe.processor_health import ChoiceFallbacks
 from rosafe.ros1.afe.published_tree import PublishedTree
 from rosafe.ros1.afe.saved_tree import SavedTree
@@ -146,11 +146,9 @@ class RosafeNode:
 
         self._run_input(activity, frames, create)
 
-    def _run_input(
-        self, activity: Activity, frames: int, create: Callable[[Source], Processor | None], seconds: float = 0.0
-    ) -> None:
+    def _run_input(self, activity: Activity, frames: int, create: Callable[[Source], Processor | None]) -> None:
         """Wait for sound, and run the input that `create` adds to the tree; it may return None instead."""
-        reader = self._audio.open_reader(frames, activity.stop_requested.is_set, max(seconds, FIRST_AUDIO_SECONDS))
+        reader = self._audio.open_reader(frames, activity.stop_requested.is_set)
         if reader is None:
             activity.raise_if_interrupted()
             raise ROSAFE.error("e_noData", f"no audio from {self._audio.topic}: is bass acquiring?")
@@ -217,7 +215,7 @@ class RosafeNode:
         else:
             with self._loading:
                 self._check_setup(setup)
-                planned = self._build_setup(setup, values["wait"])
+                planned = self._build_setup(setup)
             self._saved.save()
         return {"created": planned.created, "reused": planned.reused}
 
@@ -240,7 +238,7 @@ class RosafeNode:
             dry_run(setup, rate)
         return planned
 
-    def _build_setup(self, setup: Setup, seconds: float) -> TreePlan:
+    def _build_setup(self, setup: Setup) -> TreePlan:
         """Connect the port and create the processors. If they cannot be created, connect the previous topic again."""
         topic, previous = self._topic(setup), self._audio.topic
         if topic == previous:
@@ -248,8 +246,7 @@ class RosafeNode:
         if topic:
             self._connect(topic)
         try:
-            open_input = functools.partial(self._open_input, seconds=seconds)
-            return self._builder.build(functools.partial(plan, setup), open_input)
+            return self._builder.build(functools.partial(plan, setup), self._open_input)
         except BaseException:
             if topic and previous:
                 self._connect_audio(previous)
@@ -260,14 +257,12 @@ class RosafeNode:
         self._saved.save()
         return {"removed": removed}
 
-    def _open_input(
-        self, new: NewProcessor, create: Callable[[Source], Processor | None], topic: str = "", seconds: float = 0.0
-    ) -> None:
+    def _open_input(self, new: NewProcessor, create: Callable[[Source], Processor | None], topic: str = "") -> None:
         """Let an activity InputProc wait for sound from `topic`, create the input, and run it: see `OpenInput`."""
         self._connect(topic)
         frames = new.input_values["nFramesPerBlock"]
         activity = self._node.activities.start(
-            INPUT_PROC, lambda activity, _: self._run_input(activity, frames, create, seconds), {}, None
+            INPUT_PROC, lambda activity, _: self._run_input(activity, frames, create), {}, None
         )
         activity.begun.wait()
         error = activity.error

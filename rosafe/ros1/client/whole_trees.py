@@ -94,16 +94,33 @@ async def load(component: Rosafe, text: str, wait: float = 0.0) -> dict[str, Any
         ``::rosAFE::e_badNewValue`` if the text is not a setup, ``e_existsAlready`` if an existing object differs from
         it, and the errors of the component and of bass.
     """
-    request = {"setup": text, "check": True, "wait": 0.0}
-    await component.node_outputs(LOAD_SETUP.name, request)
+    clock = asyncio.get_running_loop().time
+    await component.node_outputs(LOAD_SETUP.name, {"setup": text, "check": True})
     setup = await asyncio.to_thread(read, text, [])
-    topic = await _topic(component, setup)
-    deadline = asyncio.get_running_loop().time() + wait
-    while topic and asyncio.get_running_loop().time() < deadline and not await component.published(topic):
+    connected = await component.port_connected(AUDIO)
+    topic = await _topic(component, setup, connected)
+    deadline = clock() + wait
+    while topic and clock() < deadline and not await component.published(topic):
         await asyncio.sleep(PAUSE)
     async with _sound(component, setup, topic) as sound:
-        request |= {"check": False, "wait": SOUND_SECONDS if sound == "started" else 0.0}
-        return {**await _create(component, LOAD_SETUP.name, request), "sound": sound}
+        try:
+            return {**await _load_tree(component, text, SOUND_SECONDS if sound == "started" else 0.0), "sound": sound}
+        except asyncio.CancelledError:
+            if connected and connected != topic:
+                await _finish(_try(component.outputs("connect_port", {"local": AUDIO, "remote": connected})))
+            raise
+
+
+async def _load_tree(component: Rosafe, text: str, seconds: float) -> Mapping[str, Any]:
+    """Let the node load the setup; try again for some seconds if there is no sound yet."""
+    deadline = asyncio.get_running_loop().time() + seconds
+    while True:
+        try:
+            return await _create(component, LOAD_SETUP.name, {"setup": text, "check": False})
+        except ComponentError as problem:
+            if problem.ex != "::rosAFE::e_noData" or asyncio.get_running_loop().time() > deadline:
+                raise
+        await asyncio.sleep(PAUSE)
 
 
 async def _create(component: Rosafe, service: str, request: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -123,6 +140,11 @@ async def _remove_created(component: Rosafe, answer: Awaitable[Mapping[str, Any]
             await component.node_outputs("removeUnused", {"names": names[max(0, end - MAX_SEQUENCE) : end]})
 
 
+async def _try(work: Awaitable[object]) -> None:
+    with contextlib.suppress(ComponentError):  # the first error is reported
+        await work
+
+
 async def _finish(work: Awaitable[object]) -> None:
     """Complete `work`, also if the task is cancelled meanwhile."""
     task = asyncio.ensure_future(work)
@@ -134,13 +156,12 @@ async def _finish(work: Awaitable[object]) -> None:
 # --- sound ------------------------------------------------------------------------------------------------------
 
 
-async def _topic(component: Rosafe, setup: Setup) -> str:
+async def _topic(component: Rosafe, setup: Setup, connected: str) -> str:
     """Return the topic for the Audio port; empty if the setup has none and the default topic is not published."""
     if AUDIO in setup.connections:
         return ros_names.resolve(setup.connections[AUDIO], component.node)
-    topic = await component.port_connected(AUDIO)
     default = ros_names.resolve(REQUEST.parameter("connect").default, component.node)
-    return topic or (default if setup.sound is not None or await component.published(default) else "")
+    return connected or (default if setup.sound is not None or await component.published(default) else "")
 
 
 @contextlib.asynccontextmanager
@@ -191,6 +212,6 @@ async def _sound(component: Rosafe, setup: Setup, topic: str) -> AsyncIterator[s
 
 
 async def _stop(bass: Services, acquired: Awaitable[object]) -> None:
-    with contextlib.suppress(ComponentError):  # the first error is reported
+    with contextlib.suppress(ComponentError):
         await acquired
         await bass.outputs("Stop", {})
