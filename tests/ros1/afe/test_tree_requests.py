@@ -128,28 +128,19 @@ def test_without_audio_nothing_is_created(graph: Graph) -> None:
         microphone.close()
 
 
-HOSTILE = {
-    "!!python/object/apply:os.system ['touch MARK']": "tags",
+HOSTILE = {  # all others: tests/setups
     "fb_nChannels: !!python/object/apply:os.system ['touch MARK']": "tags",
     "fb_cfHz: &a [100, 200], rm_wname: *a": "anchors",
-    "<<: {fb_nChannels: 4}": "unknown '<<'",
-    "[" * 100_000: "nested too deeply",
     "{fb_cfHz: " * 20_000: "nested too deeply",
-    "fb_nChannels: 4} {a: b": "not YAML",
-    "fb_nChannels: 4\n---\nfb_nChannels: 5": "second document",
-    "fb_nChannels: 4, fb_nChannels: 5": "twice",
+    '{"fb_nChannels": 4, "fb_nChannels": 5}': "twice",
+    '{"fb_nChannels": 4000}': "fb_nChannels: expected a number from 0 to 1024, got 4000",
+    '{"fb_nChannel": 4}': "did you mean fb_nChannels?",
     "- fb_nChannels": "not YAML",
-    "fb_nChannels: 4\nno": "not YAML",
     "fb_nChannels: ": "one value",
-    "fb_nChannels: {a: 1}": "one value",
     "fb_nChannels: .inf": "fb_nChannels",
-    "fb_nChannels: 4; pi_rangeHz: [1]": "not YAML",
-    "fb_lowFreqHz: __import__('os').getpid()": "fb_lowFreqHz",
-    "fb_cfHz: [" + "100," * 2000 + "]": "expected at most",
     "x" * 300_000: "characters",
     "representation: ild": "unknown 'representation'",
     "fb_nChannel: 4": "did you mean fb_nChannels?",
-    "fb_nChannels=4": "unknown 'fb_nChannels=4'",
     "rm_wname: hanning_": "one of",
 }
 
