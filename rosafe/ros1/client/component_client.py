@@ -110,7 +110,7 @@ class Call:
         return self.service is not None and self.service.activity
 
     async def run(self) -> Value:
-        """Return the result; that of an activity when it has started, with its outputs if it has ended by then."""
+        """Return the result: for an activity when it has started, with its outputs if it has ended by then."""
         if self.service is not None:
             return await self.client.call(self.service, self.values)
         assert self.port is not None

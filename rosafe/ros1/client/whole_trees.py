@@ -112,7 +112,7 @@ async def load(component: Rosafe, text: str, wait: float = 0.0) -> dict[str, Any
 
 
 async def _load_tree(component: Rosafe, text: str, seconds: float) -> Mapping[str, Any]:
-    """Let the node load the setup; try again for some seconds if there is no sound yet."""
+    """Let the node load the setup; without sound, try again for `seconds`."""
     deadline = asyncio.get_running_loop().time() + seconds
     while True:
         try:
