@@ -137,4 +137,4 @@ def _show(node: str, answer: Mapping[str, Any], kind: Representation) -> None:
     width = max(map(len, answer["dependencies"]))
     for name, ancestor in zip(answer["dependencies"], request.ancestor_kinds(kind), strict=True):
         state = "created" if name in answer["created"] else "reused"
-        print(printable(f"{state:7}  {name:{width}}  {request.topic(node, ancestor, name)}"))
+        print(printable(f"{state:7}  {name:{width}}  {ros_names.port_topic(node, ancestor, name)}"))

@@ -119,12 +119,12 @@ async def load(setup: Setup, instance: str, wait: float = 0.0) -> dict[str, Any]
 
     Returns the outputs of `interface.LOAD_SETUP`, and `localizer`: running, set or empty. Raises CommandError.
     """
-    from rosafe.ros1.client import localizer, setup_transaction
+    from rosafe.ros1.client import localizer, whole_trees
 
     async with component(instance, wait) as client:
         try:
             node = ros_names.resolve(localizer.NODE, client.node)
-            answer = {**await setup_transaction.apply(client, setup, wait), "localizer": ""}
+            answer = {**await whole_trees.load(client, write(setup), wait), "localizer": ""}
             if setup.localizer is not None:
                 await localizer.set_parameters(client.graph, node, setup.localizer)
                 answer["localizer"] = "running" if await localizer.is_registered(client.graph, node) else "set"
@@ -134,13 +134,13 @@ async def load(setup: Setup, instance: str, wait: float = 0.0) -> dict[str, Any]
 
 
 async def _captured(options: argparse.Namespace) -> str:
-    from rosafe.ros1.client import localizer, setup_transaction
+    from rosafe.ros1.client import localizer, whole_trees
 
     async with component(options.instance, options.wait) as client:
         try:
             if await localizer.is_registered(client.graph, ros_names.resolve(localizer.NODE, client.node)):
                 print("the localizer is not saved; add a section localizer (docs/setups.md)", file=sys.stderr)
-            return write(await setup_transaction.capture(client), options.full)
+            return await whole_trees.save(client, options.full)
         except ComponentError as problem:
             raise CommandError(format_error(problem)) from None
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from rosafe.commands._component import format_error, open_graph
 from rosafe.commands._parameters import add_mirror
 from rosafe.interface import ComponentError
-from rosafe.setups import AcquireSettings, Setup
+from rosafe.setups import AcquireSettings, Setup, write
 from rosafe.system import option_types
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ class _Session:
 
     async def _load(self, afe: ComponentClient | None) -> None:
         from rosafe.commands._launcher import ManagedProcess
-        from rosafe.ros1.client import setup_transaction
+        from rosafe.ros1.client import whole_trees
 
         if self._setup is None:
             return
@@ -177,7 +177,7 @@ class _Session:
             process.state, process.detail = "refused", "rosAFE is not running"
             return
         try:
-            answer = await setup_transaction.apply(afe, self._setup, wait=10.0)
+            answer = await whole_trees.load(afe, write(self._setup), wait=10.0)
             process.state = "loaded"
             process.detail = f"{name}: {len(answer['created'])} created, {len(answer['reused'])} reused"
         except ComponentError as problem:

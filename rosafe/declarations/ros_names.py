@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from rosafe.declarations.representation import Representation
+
 
 def resolve(name: str, node: str) -> str:
     """Return the full name for a `name` that is relative to the namespace of `node`, a full name.
@@ -19,3 +21,8 @@ def relative(name: str, node: str) -> str:
     ('bass/Audio', '/bass/Audio')
     """
     return name.removeprefix(f"{node.rpartition('/')[0]}/")
+
+
+def port_topic(node: str, kind: Representation, name: str) -> str:
+    """Return the topic of the processor `name` of a `kind`; only the input has no name in its topic."""
+    return f"{node}/{kind.port}" + (f"/{name}" if kind.parent else "")

@@ -190,9 +190,9 @@ def _whole_trees(kinds: Kinds) -> tuple[Service, ...]:
     return build, find, save, load
 
 
-def _ros_service(composites: tuple[Service, ...]) -> tuple[Service, ...]:
-    """Return the request for a whole tree as a ROS service."""
-    build = composites[0]
+def _ros_services(composites: tuple[Service, ...]) -> tuple[Service, ...]:
+    """Return the requests for whole trees as ROS services."""
+    build, find, save, load = composites
     parameters = (
         Parameter("representation", "string", REQUIRED, "The representation, such as ild: see request.md"),
         Parameter(
@@ -209,7 +209,27 @@ def _ros_service(composites: tuple[Service, ...]) -> tuple[Service, ...]:
             "Topic for the Audio port, if a new input needs one; empty: bass/Audio, unless the port is connected",
         ),
     )
-    return (replace(build, parameters=parameters),)
+    return (
+        replace(build, parameters=parameters),
+        replace(find, parameters=parameters),
+        replace(save, doc="The tree of processors and its connection, as the text of a setup, without sound"),
+        replace(
+            load,
+            doc="Connect the Audio port and build the tree that a setup describes: completely, or without any change. "
+            "The section sound is for clients, which call bass",
+            parameters=(
+                *load.parameters,
+                Parameter("check", "boolean", False, "Flag to change nothing, and to return what would be created"),
+            ),
+            outputs=load.outputs[:2],
+        ),
+        Service(
+            "removeUnused",
+            "Remove processors, except those that others depend on",
+            (Parameter("names", "sequence<string>", (), "The names, in the order of their creation"),),
+            outputs=(("removed", "sequence<string>"),),
+        ),
+    )
 
 
 _FUNCTIONS = (
@@ -335,7 +355,7 @@ def derive(kinds: Kinds) -> ComponentSpec:
         structs={**_structs(kinds), **BINAUDIO, **GENOM_STATE},
         messages=_LOCALIZER_MESSAGES,
         client_side_services=composites,
-        ros_services=_ros_service(composites),
+        ros_services=_ros_services(composites),
     )
 
 

@@ -103,10 +103,10 @@ class ComponentSpec:
     structs: Mapping[str, Struct]  # by IDL name
     # Messages of topics that are not ports, by their ROS names.
     messages: Mapping[str, Struct] = field(default_factory=dict)
-    # Requests that clients such as genomixd carry out by calling several services.
+    # Requests for whole trees in the form that clients such as genomixd offer.
     client_side_services: tuple[Service, ...] = ()
-    # Those of them that the component also offers as ROS services of the same names. ROS tools fill in every field of
-    # a request, hence one string holds all parameters. Clients of genomixd do not see these.
+    # The ROS services that carry them out. ROS tools fill in every field of a request, hence one string holds all
+    # parameters. Clients of genomixd do not see these.
     ros_services: tuple[Service, ...] = ()
 
     @property

@@ -19,8 +19,7 @@ from rosafe.processing.signals import frame_times
 from rosafe.representations import BUILTIN, STAGES
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
-from rosafe.tree.context import Observer
-from rosafe.tree.processor import Processor
+from rosafe.tree.processor import Observer, Processor
 from rosafe.tree.tree import Tree
 
 # Limits of a block that is merged from smaller ones: its frames, and the output of any processor for it

@@ -1,27 +1,19 @@
-"""Plan how to load a setup into an existing tree: the processors to reuse, and the requests for the others."""
+"""Plan how to load a setup into an existing tree: the processors to reuse, and those to create."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.interface import ROSAFE, format_value
 from rosafe.representations import STAGES
-from rosafe.tree.tree_planner import ExistingProcessor, ServiceCall, creation_call
+from rosafe.tree.tree_planner import ExistingProcessor, NewProcessor, TreePlan
 
 from .setup import Setup, SetupProcessor
 
 
-class SetupPlan(NamedTuple):
-    """Names in the tree of the setup's processors (parents first), the names of those reused, and the calls to make."""
-
-    names: list[str]
-    reused: list[str]
-    steps: list[ServiceCall]
-
-
-def plan(setup: Setup, existing: Sequence[ExistingProcessor]) -> SetupPlan:
+def plan(setup: Setup, existing: Sequence[ExistingProcessor]) -> TreePlan:
     """Return the plan for `setup` in a tree that consists of the `existing` processors.
 
     A processor is reused if its name and all its values are the same, to the last digit. A tree has only one input,
@@ -36,7 +28,7 @@ def plan(setup: Setup, existing: Sequence[ExistingProcessor]) -> SetupPlan:
     tree_input = next((p for p in existing if not p.parent), None)
     sample_rate = tree_input.rate if tree_input else 0.0
     names: dict[str, str] = {}  # from the setup to the tree
-    reused, steps = [], []
+    steps: list[NewProcessor] = []
     for processor in setup.processors:
         parent = names.get(processor.parent, "")
         same = by_name.get(processor.name)
@@ -44,15 +36,14 @@ def plan(setup: Setup, existing: Sequence[ExistingProcessor]) -> SetupPlan:
             same = tree_input
         if same is None:
             names[processor.name] = processor.name
-            steps += creation_call(processor.spec, processor.name, parent, processor.input_values)
+            steps.append(processor.spec.creation(processor.name, parent, processor.input_values))
         else:
             difference = _difference(processor, parent, same, sample_rate)
             if difference:
                 advice = "remove it first (the input: Stop), or load another setup"
                 raise ROSAFE.error("e_existsAlready", what=f"{same.name!r} exists already and {difference}; {advice}")
             names[processor.name] = same.name
-            reused.append(same.name)
-    return SetupPlan(list(names.values()), reused, steps)
+    return TreePlan(list(names.values()), steps)
 
 
 def _difference(processor: SetupProcessor, parent: str, existing: ExistingProcessor, sample_rate: float) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -60,17 +62,28 @@ def read(text: str, absent: list[str] | None = None) -> Setup:
 def read_parameters(text: str) -> dict[str, Any]:
     """Return the checked parameters of a tree request in `text`; an empty text contains none.
 
-    The text is a YAML mapping: one line for each parameter, or a single line, whose braces are optional.
+    The text is a YAML mapping: one line for each parameter, or a single line, whose braces are optional. The values of
+    a JSON object are returned unchecked: programs send them, and the request checks them.
 
     Raises
     ------
     SetupError
         The text is not such a mapping, or the interface does not allow its values.
     """
+    with contextlib.suppress(ValueError, RecursionError):
+        if isinstance(values := json.loads(text, object_pairs_hook=_unique), dict):
+            return values
     short = text.strip()
     if short and not short.startswith("{") and "\n" not in short:
         text = f"{{{short}\n}}"  # the line break ends a comment
     return _values(parse(text, MAX_PARAMETER_VALUES), _TREE_PARAMETERS, "parameters")
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the members of a JSON object; ValueError if a name occurs twice."""
+    if len(dict(pairs)) < len(pairs):
+        raise ValueError
+    return dict(pairs)
 
 
 def _connections(node: YamlNode) -> Iterator[tuple[str, str]]:

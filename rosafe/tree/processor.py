@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from time import monotonic, thread_time
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.numeric_limits import FloatArray
@@ -14,16 +15,49 @@ from rosafe.dsp.plugin_checks import CheckedStage, PluginError
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block, Source, new_block
-from rosafe.tree.context import TreeContext
 from rosafe.tree.history import History
 from rosafe.tree.parameter_updates import ParameterUpdates
-from rosafe.tree.source_reader import SourceReader
 from rosafe.tree.states import State, StateMachine
+from rosafe.tree.workers import Workers
 
 T = TypeVar("T")
 _NO_EXTRAS: frozenset[str] = frozenset()
 SLOW_LISTENER_SECONDS = 2.5e-4  # a listener that takes longer is called in a turn of its own
 ESTIMATE_GROWTH = 2.0  # the estimate is the recent minimum; it may grow by this factor per block
+
+
+class TreeListener(Protocol):
+    """Callbacks for processor events. They run on worker threads and must not block on the tree."""
+
+    def on_added(self, processor: Processor) -> None:
+        """A processor is about to start and has released nothing yet. If this raises, it is removed again."""
+
+    def on_executed(self, processor: Processor, seconds: float) -> None:
+        """One block was computed in `seconds`. The call for the last block may follow `on_removed`."""
+
+    def on_released(self, processor: Processor, block: Block) -> None:
+        """A processor with consumers released a block. One worker calls at a time, and never after `on_removed`."""
+
+    def on_removed(self, processor: Processor) -> None:
+        """The processor was removed; `processor.error` is the reason if it failed."""
+
+
+# Called with (processor, new state, number of the current block or None), under the tree's lock: must not block.
+Observer = Callable[["Processor", State, "int | None"], None]
+
+
+@dataclass(frozen=True)
+class TreeContext:
+    """The context that all processors of a tree share.
+
+    The worker calls `on_failure` after it has set the `error` of a processor.
+    """
+
+    workers: Workers
+    listener: TreeListener
+    on_failure: Callable[[Processor], None]
+    finished_condition: threading.Condition  # on the tree's lock: notified when a processor is finished
+    observers: list[Observer] = field(default_factory=list)
 
 
 class Processor(StateMachine):
@@ -263,6 +297,58 @@ class Processor(StateMachine):
                 self._context.listener.on_released(self, block)
         self.blocked_since = 0.0
         self._publish_seconds = monotonic() - begun
+
+
+class SourceReader:
+    """Reads the blocks of `source` for the input `processor`, whose tasks `workers` run."""
+
+    def __init__(self, processor: Processor, source: Source, workers: Workers) -> None:
+        self._processor = processor
+        self._source = source
+        self._workers = workers
+        self.stop = source.stop
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._source.open(self._wake)
+        self._notify_workers()
+
+    def check(self) -> None:
+        """Read if the source has a block for which it did not call `wake`."""
+        if not self._source.waiting:
+            self._notify_workers()
+
+    def read(self) -> None:
+        """Read the next block of the source if there is one, or end with the source."""
+        processor, source = self._processor, self._source
+        processor.blocked_since = monotonic()
+        while True:
+            ended = source.ended  # read first: blocks that arrived before the end are still processed
+            got = source.read()
+            if got is not None or ended == source.ended:
+                break
+        more = not source.waiting
+        processor.blocked_since = 0.0
+        with self._workers.lock:
+            if got is not None:
+                block = Block(processor.blocks, (got[0],), got[1], processor.stage.input_format)
+                processor.accept_input_block(block, more)
+            elif ended:
+                processor.end_of_stream()
+
+    def _wake(self) -> None:
+        """Run short tasks on the thread of the source. Observers show the worker of each task, and need workers."""
+        if self._processor.observers:
+            self._notify_workers()
+            return
+        with self._workers.lock:
+            self._processor.notify_input()
+            self._workers.run_short_tasks()
+
+    def _notify_workers(self) -> None:
+        with self._workers.lock:
+            self._processor.notify_input()
+            self._workers.wake()
 
 
 def _requested_extras(stage: Stage, children: Sequence[Processor], number: int) -> frozenset[str]:

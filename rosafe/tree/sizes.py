@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Collection
 from pathlib import Path
 
 from rosafe.dsp.framing import FramedStage
@@ -86,13 +86,17 @@ def _shape(rows: Rows) -> str:
     return "x".join(map(str, rows))
 
 
-def check_all(stages: Iterable[tuple[Stage, Rows]], seconds: float) -> None:
-    """Raise ValueError if `seconds` of output and the states of all stages exceed their share of the memory."""
-    sizes = [output_size(stage, rows, seconds) + state_size(stage, rows) for stage, rows in stages]
+def total_size(stage: Stage, rows: Rows, seconds: float) -> float:
+    """Return the bytes of `seconds` of the output of `stage` and of its state."""
+    return output_size(stage, rows, seconds) + state_size(stage, rows)
+
+
+def check_all(taken: Collection[float], seconds: float) -> None:
+    """Raise ValueError if the bytes `taken` by all processors, for each its `total_size`, exceed their share."""
     check_memory(
-        f"{len(sizes)} processors",
+        f"{len(taken)} processors",
         MAX_MEMORY_FRACTION * machine_memory(),
-        sum(sizes),
+        sum(taken),
         "remove processors, or take shorter buffers",
         f"{MAX_MEMORY_FRACTION:.0%} of this machine's memory",
         f"{seconds:g} s of output, and the states",

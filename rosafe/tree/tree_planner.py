@@ -1,12 +1,10 @@
-"""Plan of a request for a whole tree: the processors to reuse, and the service calls that create the others.
+"""Plan of a request for a whole tree: the processors to reuse, and those to create.
 
-This module calls no service. rosafe/tree/tree_builder.py executes the plan; docs/request.md has the rules.
+rosafe/tree/tree_builder.py executes the plan; docs/request.md has the rules.
 """
 
 from __future__ import annotations
 
-import itertools
-import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,18 +12,16 @@ from typing import Any, NamedTuple
 
 from rosafe.declarations import plugins
 from rosafe.declarations.text import did_you_mean
-from rosafe.interface import KINDS, REQUEST, ROSAFE, ComponentError, Representation, format_value
+from rosafe.interface import KINDS, REQUEST, ROSAFE, Representation, format_value
 from rosafe.interface.arguments import check_parameters
 from rosafe.representations import PROBLEMS, STAGES
 
-INTERRUPTED = "::genom::interrupted"
-_RACES = {f"::rosAFE::{short}" for short in ("e_existsAlready", "e_noUpperDependencie", "e_noSuchProcessor")}
 # Parameters that only the creation of an input needs: the topic, and those of InputProc except its name.
 OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").parameters[1:]))
 
 
 class ExistingProcessor(NamedTuple):
-    """A processor of the tree. `values` are those that getParameters returns; `parent` is empty for the input."""
+    """A processor of the tree. `values` are its parameters; `parent` is empty for the input."""
 
     name: str
     kind: str
@@ -34,19 +30,37 @@ class ExistingProcessor(NamedTuple):
     rate: float = 0.0  # frames of output per second
 
 
-class ServiceCall(NamedTuple):
-    """A service call with all its values. `creates` is the name of the processor that it creates, if any."""
+class NewProcessor(NamedTuple):
+    """A processor to create. `parameters` are those of its stage; an input also has the values of InputProc."""
 
-    service: str
-    values: dict[str, Any]
-    creates: str = ""
+    name: str
+    kind: str
+    parent: str
+    parameters: Mapping[str, Any]
+    input_values: Mapping[str, Any] = {}
 
 
 class TreePlan(NamedTuple):
-    """The names from the input down to the requested processor, and the calls that create the missing ones."""
+    """The names of all processors of a request, parents first, and those of them that have to be created."""
 
-    dependencies: list[str]
-    steps: list[ServiceCall]
+    names: list[str]
+    steps: list[NewProcessor]
+
+    @property
+    def created(self) -> list[str]:
+        """The names of the processors to create."""
+        return [step.name for step in self.steps]
+
+    @property
+    def reused(self) -> list[str]:
+        """The names of the existing processors."""
+        created = set(self.created)
+        return [name for name in self.names if name not in created]
+
+    @property
+    def new_input(self) -> NewProcessor | None:
+        """The input, if it has to be created."""
+        return self.steps[0] if self.steps and not self.steps[0].parent else None
 
 
 @dataclass(frozen=True)
@@ -82,6 +96,14 @@ class ProcessorSpec:
             stage = STAGES[self.kind.kind]
             effective = stage.effective_values(stage.resolve_rate_defaults(self.values, self.explicit, sample_rate))
         return reported in (effective, {**effective, **self.explicit})
+
+    def creation(self, name: str, parent: str, input_values: Mapping[str, Any]) -> NewProcessor:
+        """Return the step that creates this processor; only an input uses the `input_values`."""
+        kind = self.kind
+        free = {p.name for p in kind.parameters if p.follows_rate and p.name not in self.explicit}
+        requested = STAGES[kind.kind].request_values(self.values)
+        parameters = {parameter: value for parameter, value in requested.items() if parameter not in free}
+        return NewProcessor(name, kind.kind, parent, parameters, {} if kind.parent else input_values)
 
 
 @dataclass(frozen=True)
@@ -166,8 +188,8 @@ def _spec(kind: Representation, checked: Mapping[str, Any]) -> ProcessorSpec:
 # --- plans ------------------------------------------------------------------------------------------------------
 
 
-def plan(request: TreeRequest, found: Sequence[ExistingProcessor], reserved: Collection[str] = ()) -> TreePlan:
-    """Plan `request` in a tree that consists of `found`. New processors get none of the names `reserved`.
+def plan(request: TreeRequest, found: Sequence[ExistingProcessor]) -> TreePlan:
+    """Plan `request` in a tree that consists of `found`.
 
     The longest chain of existing processors that match is reused; the others are created below it under new names.
 
@@ -179,15 +201,14 @@ def plan(request: TreeRequest, found: Sequence[ExistingProcessor], reserved: Col
     root = next((p for p in found if not p.parent and p.kind == "input"), None)
     if root is not None:
         _check_input(root, request.specs[0])
-    reused = _longest_match(request.specs, found, root.rate if root is not None else 0.0)
-    names = {*reserved, *(p.name for p in found)}
-    dependencies, steps = reused[:], []
-    for spec in request.specs[len(reused) :]:
-        name = free_name(spec.kind, names)
-        names.add(name)
-        steps += creation_call(spec, name, dependencies[-1] if dependencies else "", request.input_values)
-        dependencies.append(name)
-    return TreePlan(dependencies, steps)
+    names = _longest_match(request.specs, found, root.rate if root is not None else 0.0)
+    used = {p.name for p in found}
+    steps: list[NewProcessor] = []
+    for spec in request.specs[len(names) :]:
+        name = free_name(spec.kind, used)
+        steps.append(spec.creation(name, names[-1] if names else "", request.input_values))
+        names.append(name)
+    return TreePlan(names, steps)
 
 
 def _check_input(root: ExistingProcessor, spec: ProcessorSpec) -> None:
@@ -221,64 +242,7 @@ def free_name(kind: Representation, names: Collection[str]) -> str:
     return f"{kind.word}_{number}"
 
 
-def creation_call(spec: ProcessorSpec, name: str, parent: str, input_values: Mapping[str, Any]) -> list[ServiceCall]:
-    """Return the calls that create one processor.
-
-    InputProc does not accept the parameters of the input's stage: modifyParameter sets them before the input has
-    children. `input_values` are the other parameters of InputProc except its name; only an input uses them.
-    """
-    kind = spec.kind
-    if kind.parent:
-        free = {p.name: math.nan for p in kind.parameters if p.follows_rate and p.name not in spec.explicit}
-        return [ServiceCall(kind.request, {"name": name, "upperDepName": parent, **spec.values, **free}, name)]
-    changed = {p.name: spec.values[p.name] for p in kind.parameters if spec.values[p.name] != p.default}
-    return [
-        ServiceCall(kind.request, {"name": name, **input_values}, name),
-        *(
-            ServiceCall("modifyParameter", {"nameProc": name, "nameParam": parameter, "newValue": format_value(value)})
-            for parameter, value in changed.items()
-        ),
-    ]
-
-
-# --- responses --------------------------------------------------------------------------------------------------
-
-
-def build_response(
-    request: TreeRequest, dependencies: Sequence[str], created: Collection[str], node: str
-) -> dict[str, Any]:
-    """Return the outputs of `interface.REQUEST` when the processors `dependencies` exist."""
-    kinds = [spec.kind for spec in request.specs]
-    return {
-        "name": dependencies[-1],
-        "dependencies": list(dependencies),
-        "created": [name for name in dependencies if name in created],
-        "reused": [name for name in dependencies if name not in created],
-        "unused": unused(kinds, request.explicit, dependencies[0] in created),
-        "port": kinds[-1].port,
-        "topic": topic(node, kinds[-1], dependencies[-1]),
-    }
-
-
 def unused(kinds: Iterable[Representation], names: Iterable[str], new_input: bool) -> list[str]:
     """Return the parameters `names` that have no effect on a processor with these kinds from the input down to it."""
     own = {p.name for kind in kinds for p in kind.parameters} | {*(OF_THE_INPUT if new_input else ())}
     return [name for name in names if name not in own]
-
-
-def topic(node: str, kind: Representation, name: str) -> str:
-    """Return the topic of the processor `name`."""
-    return f"{node}/{kind.port}" + (f"/{name}" if ROSAFE.port(kind.port).multiple else "")
-
-
-def chain_exists(dependencies: Sequence[str], found: Iterable[ExistingProcessor]) -> bool:
-    """Return whether these names are a chain of parents and children that begins with the input."""
-    parents = {p.name: p.parent for p in found}
-    return all(parents.get(name) == parent for parent, name in itertools.pairwise(["", *dependencies]))
-
-
-def is_race(problem: ComponentError) -> bool:
-    """Return whether another client changed the tree after it was listed, so that a new plan is needed."""
-    if problem.ex == INTERRUPTED:
-        return problem.detail.get("by") == "InputProc"
-    return problem.ex in _RACES

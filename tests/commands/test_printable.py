@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rosafe.commands.__main__ import main
-from rosafe.ros1.afe.tree_state_file import TreeStateFile
+from rosafe.ros1.afe.saved_tree import TreeStateFile
 from rosafe.setups import Setup
 from rosafe.setups.setup import AcquireSettings
 from rosafe.system.terminal import printable

@@ -61,6 +61,10 @@ SERVICES = {
         "modifyParameter": "972a89083cfb6e30281281ef02eaf593",
         "removeProcessor": "a04032386d532fbd9abbc736abb34893",
         "request": "ba0b1737531cf2d4c5f90f7a785a29f5",
+        "find": "ba0b1737531cf2d4c5f90f7a785a29f5",
+        "saveSetup": "bd80b5122fed958f5b1064544766cd1e",
+        "loadSetup": "2d2423f88caa1ef6d6a61623ccc9b472",
+        "removeUnused": "a48e4dca96e0e251f987f8765c33798f",
     },
     "bass": {**COMMON_SERVICES, "ListDevices": EMPTY_REPLY, "getAcquisition": "1393f375a654c7c5f67cac5c520e194b"},
 }

@@ -20,7 +20,7 @@ from rosafe.commands.setup import read_file
 from rosafe.interface import ComponentError
 from rosafe.processing.corpus import write_failed
 from rosafe.processing.files import process_file
-from rosafe.ros1.afe.tree_state_file import TreeStateFile
+from rosafe.ros1.afe.saved_tree import TreeStateFile
 from rosafe.setups import Setup
 from rosafe.system import input as inputs
 from rosafe.system.input import open_descriptor, open_regular, read_regular

@@ -116,10 +116,10 @@ class Recorder:
 class Plain(Stage):
     """A stage of any kind, with any parameters, that returns its input."""
 
-    work: Callable[[np.ndarray], None] = staticmethod(lambda block: None)
-
     def process(self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None) -> np.ndarray:
-        self.work(block)
+        return self.compute(block)
+
+    def compute(self, block: np.ndarray) -> np.ndarray:
         return block
 
     def _checked_values(self, changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -162,5 +162,5 @@ def end(tree: Tree, listener: Recorder) -> None:
     for processor in listener.processors:
         assert processor.join(PATIENCE), f"{processor!r} is still running"
     tree.join()
-    assert tree_threads() == set()
+    assert not tree_threads(), tree_threads()
     assert listener.late == []

@@ -110,33 +110,18 @@ def test_a_change_of_each_parameter(tree: Tree, feed: Feed, listener: Recorder, 
 
 def test_values_that_are_rejected(tree: Tree, feed: Feed) -> None:
     grow(tree, feed)
-    refusals = {
-        "pp_bRemoveDC": ("2", "10", "TRUE", "True", "1.0", "yes", "", "0 1"),
-        "pp_cutoffHzDC": ("", "inf", "nan", "-inf", "0x10", "1,5", "12abc", "1e400", "0", "-1", "1 2", "."),
-        "pp_coefPreEmphasis": ("1.0001", "-2", "1_0"),
-        "pp_refSPLdB": ("1e9",),
-        "in_normalizeValue": (
-            "0",
-            "-1",
-            "5.0",
-            "1e3",
-            "",
-            "18446744073709551616",
-            "0x10",
-            "9" * 5000,
-            "\N{ARABIC-INDIC DIGIT FIVE}",
-        ),
-        "fb_nChannels": ("-1", "1e1", "1025", "4294967297", "+"),
-        "fb_cfHz": ("100 abc", "8000", "-5", "0 100", "nan", "1 " * 2000),
-        "fb_lowFreqHz": ("5000", "0"),
+    refusals = {  # texts and ranges: tests/interface
+        "pp_bRemoveDC": ("2", ""),
+        "pp_cutoffHzDC": ("nan", "0"),
+        "in_normalizeValue": ("0", "5.0"),
+        "fb_nChannels": ("-1", "1025"),
+        "fb_cfHz": ("100 abc", "8000", "-5", "0 100", "1 " * 2000),
+        "fb_lowFreqHz": ("5000",),
         "fb_highFreqHz": ("50", "8001"),
         "fb_nERBs": ("0", "1e-9"),
-        "fb_nGamma": ("0", "129"),
-        "fb_bwERBs": ("0",),
-        "ild_wSizeSec": ("0", "1e-9", "61", "-0.02"),
-        "rm_hSizeSec": ("0", "1e-9"),
-        "rm_decaySec": ("0", "-1"),
-        "cc_maxDelaySec": ("0", "11"),
+        "ild_wSizeSec": ("1e-9", "61"),
+        "rm_hSizeSec": ("1e-9",),
+        "cc_maxDelaySec": ("11",),
     }
     for name, texts in refusals.items():
         processor = tree.find(OWNER[name])
@@ -232,9 +217,7 @@ def test_a_change_does_not_wait_for_a_block_and_does_not_affect_it(
     working, go_on = threading.Event(), threading.Event()
 
     class Slow(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
+        def compute(self, block: np.ndarray) -> np.ndarray:
             before = dict(self.parameters)
             working.set()
             assert go_on.wait(PATIENCE)

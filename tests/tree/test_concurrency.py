@@ -31,63 +31,6 @@ def workers() -> int:
     return 4
 
 
-def test_siblings_work_at_the_same_time(
-    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each waits during its computation until the other two are computing."""
-    meeting = threading.Barrier(3)
-
-    class Meeting(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
-            meeting.wait(PATIENCE)
-            return block
-
-    use_plain_stages(monkeypatch, preProc=Meeting)
-    tree.add_input("input", feed, 1, 1.0, 1.0)
-    siblings = [tree.add("preProc", name, "input") for name in ("a", "b", "c")]
-    feed.put(count=3)
-    for one in siblings:
-        listener.wait_blocks(one, 3)
-        assert one.error is None
-
-
-def test_a_parent_works_on_the_next_block_while_its_child_works_on_the_last(
-    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The child finishes block n only after the parent has computed n + 1; the parent releases only after that."""
-    computed: list[int] = []
-    last = 6
-    was_computed = threading.Condition()
-
-    class Parent(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
-            with was_computed:
-                computed.append(int(block[0, 0]))
-                was_computed.notify_all()
-            return block
-
-    class Child(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
-            with was_computed:
-                number = int(block[0, 0])
-                assert was_computed.wait_for(lambda: number == last or number + 1 in computed, PATIENCE)
-                assert number + 2 not in computed, "the parent continued without the child's token"
-            return block
-
-    use_plain_stages(monkeypatch, preProc=Parent, gammatone=Child)
-    tree.add_input("input", feed, 1, 1.0, 1.0)
-    tree.add("preProc", "parent", "input")
-    child = tree.add("gammatone", "child", "parent")
-    feed.put(count=last + 1)
-    listener.wait_blocks(child, last + 1)
-
-
 def test_children_read_the_parents_memory(
     tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,17 +51,13 @@ def test_a_block_without_consumers_is_freed_when_the_children_are_finished(
     created: list[weakref.ref[np.ndarray]] = []
 
     class Parent(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
+        def compute(self, block: np.ndarray) -> np.ndarray:
             output = block.copy()
             created.append(weakref.ref(output))
             return output
 
     class Child(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
+        def compute(self, block: np.ndarray) -> np.ndarray:
             return np.empty((2, 0))
 
     use_plain_stages(monkeypatch, preProc=Parent, gammatone=Child)
@@ -164,9 +103,7 @@ def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch
     working, go_on = threading.Event(), threading.Event()
 
     class Slow(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
+        def compute(self, block: np.ndarray) -> np.ndarray:
             working.set()
             assert go_on.wait(PATIENCE)
             return block
@@ -192,44 +129,6 @@ def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch
     assert [p.state for p in (root, parent, child)] == [State.REMOVED] * 3
 
 
-def test_no_processor_waits_for_a_removed_child(
-    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is removed during its computation. The request does not wait for it, and its name is free immediately."""
-    working, go_on = threading.Event(), threading.Event()
-
-    class Slow(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
-            if self.parameters.get("slow"):
-                working.set()
-                assert go_on.wait(PATIENCE)
-            return block
-
-    use_plain_stages(monkeypatch, preProc=Slow)
-    root = tree.add_input("input", feed, 1, 1.0, 1.0)
-    slow = tree.add("preProc", "slow", "input", {"slow": True})
-    below = tree.add("gammatone", "below", "slow")
-    other = tree.add("preProc", "other", "input")
-    feed.put(count=5)
-    assert working.wait(PATIENCE)
-    listener.wait_blocks(other, 1)
-    wait_for(lambda: (root.state, other.state) == (State.WAIT_RELEASE, State.WAIT_EXEC))
-    assert len(listener.blocks[root]) == 1
-    assert tree.remove("slow") == [below, slow]
-    assert listener.ends == [below, slow]
-    listener.wait_blocks(other, 5)
-    listener.wait_blocks(root, 5)  # whose block may be published after that of a fast child
-    again = tree.add("preProc", "slow", "input")
-    feed.put(count=1)
-    listener.wait_blocks(again, 2)
-    assert not slow.join(0.0)
-    go_on.set()
-    assert slow.join(PATIENCE)
-    assert listener.blocks[slow] == listener.blocks[below] == []
-
-
 def test_blocks_are_complete_and_in_order_while_processors_are_added_and_removed(
     tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -237,9 +136,7 @@ def test_blocks_are_complete_and_in_order_while_processors_are_added_and_removed
     dice = random.Random(1)
 
     class Erratic(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
+        def compute(self, block: np.ndarray) -> np.ndarray:
             for _ in range(dice.choice((0, 0, 10, 300))):
                 pass
             return block

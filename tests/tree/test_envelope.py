@@ -200,17 +200,3 @@ def test_a_switch_and_its_reversal_before_a_block_have_no_effect(
     settle(tree, feed, listener, *NOISE[2:5])
     assert provided == [False] * 5
     assert_as(listener, tree, "ihc", chain().run(list(NOISE[:5]), [(2, "ihc_method", "fullwave")]))
-
-
-def test_two_hair_cells_of_which_one_requires_the_envelope(tree: Tree, feed: Feed, listener: Recorder) -> None:
-    grow(tree, feed)
-    other = tree.add("ihc", "other", "gammatone", {"ihc_method": "hilbert"})
-    settle(tree, feed, listener, *NOISE[:3])
-    tree.modify("gammatone", "fb_type", "drnl")
-    tree.modify("gammatone", "fb_nChannels", "4")
-    settle(tree, feed, listener, *NOISE[3:6])
-    changes = [(3, "fb_type", "drnl"), (3, "fb_nChannels", 4)]
-    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:6]), changes))
-    expected = chain(ihc_method="hilbert").run(list(NOISE[:6]), changes)
-    for block, output in zip(listener.blocks[other], expected, strict=True):
-        np.testing.assert_allclose(block.data, output["ihc"], rtol=0, atol=1e-12)

@@ -146,17 +146,6 @@ def assert_rejected(tree: Tree, text: str, name: str, parameter: str, value: str
     assert {p: (p.stage.parameters, p.signal, p.stage) for p in tree.processors} == before
 
 
-def test_properties_of_a_processor(tree: Tree, feed: Feed) -> None:
-    grow(tree, feed)
-    coarser, picky, below = (tree.find(name) for name in ("coarser", "picky", "below"))
-    assert (coarser.kind, picky.representation) == ("preProc", Picky.REPRESENTATION)
-    assert (coarser.signal.hop, coarser.rate, picky.rate) == (2, RATE / 2, RATE / 2)
-    assert (picky.output_shape, picky.output_shapes, below.output_shape) == ((2,), ((2,), ()), (2,))
-    assert [part.axes for part in picky.representation.parts] == [("ear", "time"), ("time",)]
-    assert coarser.stage.parameters == {"pp_step": 2, "pp_lags": 10}
-    assert coarser.stage.derived == {}
-
-
 def test_parts_and_delayed_frames(tree: Tree, feed: Feed, listener: Recorder) -> None:
     """Children get the first part, histories contain all; the index is that of the newest released frame."""
     grow(tree, feed)

@@ -34,17 +34,13 @@ def test_overlap_of_parent_and_child_and_of_siblings(
     siblings_meet, all_meet = threading.Barrier(2), threading.Barrier(3)
 
     class Parent(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
+        def compute(self, block: np.ndarray) -> np.ndarray:
             if block[0, 0] > 0:
                 all_meet.wait(PATIENCE)
             return block
 
     class Sibling(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
+        def compute(self, block: np.ndarray) -> np.ndarray:
             siblings_meet.wait(PATIENCE)
             if block[0, 0] < last:
                 all_meet.wait(PATIENCE)

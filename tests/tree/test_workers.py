@@ -71,9 +71,7 @@ def test_the_number_of_concurrent_computations_is_that_of_the_workers(
     now = 0
 
     class Counted(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
+        def compute(self, block: np.ndarray) -> np.ndarray:
             nonlocal now
             with lock:
                 now += 1
@@ -104,9 +102,7 @@ def test_one_worker_completes_a_block_before_the_next(
     order: list[tuple[str, int]] = []
 
     class Recorded(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
+        def compute(self, block: np.ndarray) -> np.ndarray:
             order.append((self.parameters["name"], int(block[0, 0])))
             return block
 
@@ -157,42 +153,27 @@ class EstimatedTask:
 
 
 @pytest.mark.parametrize(
-    ("seconds", "expected"),
+    ("real_time", "seconds", "expected"),
     [
-        ([1e-5, 1e-5], False),
-        ([1e-3, 1e-5], True),
-        ([1e-5, 1e-3], True),
-        ([math.inf, 1e-5], True),
-        ([1e-5, math.inf], True),
-        ([2e-4, 2e-4], False),
-        ([1e-5] * 10, False),
-        ([1e-5] * 100, True),
+        (False, [1e-5, 1e-5], False),
+        (False, [1e-3, 1e-5], True),
+        (False, [1e-5, math.inf], True),
+        (False, [2e-4, 2e-4], False),
+        (False, [1e-5] * 100, True),
+        (True, [1e-3] * 12, False),  # a block of 12000 frames takes about 10 ms
+        (True, [2e-2, 1e-5], True),
+        (True, [1e-3] * 30, True),
     ],
 )
-def test_another_worker_is_woken_only_for_long_tasks(seconds: list[float], expected: bool) -> None:
-    """No other worker is woken if the own task and all waiting ones together are short."""
+def test_another_worker_is_woken_only_for_long_tasks(real_time: bool, seconds: list[float], expected: bool) -> None:
+    """No other one is woken if the own task and all waiting ones are short, unless the tree does not keep up."""
     own, *waiting = map(EstimatedTask, seconds)
-    workers = pool.Workers(threading.RLock(), 2)
+    workers = pool.Workers(threading.RLock(), 2, real_time)
     for task in waiting:
         workers.push(task)
     assert workers._should_wake_another(own) == expected
     workers._busy_since -= 2 * pool.BUSY_SECONDS
     assert workers._should_wake_another(own) == (sum(seconds) > pool.BUSY_THRESHOLD_SECONDS)
-
-
-@pytest.mark.parametrize(
-    ("seconds", "expected"),
-    [([1e-3] * 12, False), ([2e-2, 1e-5], True), ([1e-3] * 30, True), ([math.inf, 1e-5], True)],
-)
-def test_in_real_time_another_worker_is_woken_for_20_ms_of_work(seconds: list[float], expected: bool) -> None:
-    """A block of 12000 frames takes about 10 ms; if the tree does not keep up, all workers are used as otherwise."""
-    own, *waiting = map(EstimatedTask, seconds)
-    workers = pool.Workers(threading.RLock(), 2, real_time=True)
-    for task in waiting:
-        workers.push(task)
-    assert workers._should_wake_another(own) == expected
-    workers._busy_since -= 2 * pool.BUSY_SECONDS
-    assert workers._should_wake_another(own)
 
 
 class RecordedTask(EstimatedTask):
@@ -370,9 +351,9 @@ def test_the_estimated_duration_contains_no_waiting(
     waited = 0.2  # s
 
     class Waiting(Plain):
-        @staticmethod
-        def work(block: np.ndarray) -> None:
+        def compute(self, block: np.ndarray) -> np.ndarray:
             threading.Event().wait(waited)
+            return block
 
     use_plain_stages(monkeypatch, preProc=Waiting)
     tree.add_input("input", feed, 1, 1.0, 1.0)
@@ -444,9 +425,7 @@ def test_a_long_computation_does_not_block_requests(
     working, go_on = threading.Event(), threading.Event()
 
     class Long(Plain):
-        def process(
-            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
-        ) -> np.ndarray:
+        def compute(self, block: np.ndarray) -> np.ndarray:
             if self.parameters.get("long"):
                 working.set()
                 assert go_on.wait(PATIENCE)

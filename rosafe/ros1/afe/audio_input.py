@@ -63,7 +63,7 @@ class AudioInput:
         )
 
     def open_reader(self, frames_per_block: int, interrupted: Callable[[], bool]) -> AudioReader | None:
-        """Return a reader that starts with the next frame; None if there is no audio, or if `interrupted()`."""
+        """Return a reader that starts with the next frame; None without audio, or if `interrupted()`."""
         if not self.topic:
             raise ROSAFE.error("e_noData", "the Audio port is not connected: call connect_port first")
         return self.ring.open_reader(frames_per_block, FIRST_AUDIO_SECONDS, interrupted)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.interface import KINDS, LAYOUTS, ROSAFE
+from rosafe.interface import LAYOUTS
 from rosafe.ros1.component import serialization
 from rosafe.ros1.transport.publisher import NewestMessage, Publisher
 from rosafe.tree.processor import Processor
@@ -111,8 +111,3 @@ class OutputPorts:
     def observed(self) -> bool:
         """Whether the tree has observers, which are to see each block."""
         return any(processor.observers for processor in tuple(self._by_processor)[:1])
-
-
-def element(kind: str, name: str) -> str:
-    """Return the element of a multiple port that belongs to a processor; '' for the simple port of the input."""
-    return name if ROSAFE.port(KINDS[kind].port).multiple else ""

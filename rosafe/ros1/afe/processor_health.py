@@ -1,29 +1,32 @@
-"""The state of the processors in /diagnostics: load, failures, slow calls, and replaced choices."""
+"""The state of the processors in /diagnostics: load, failures, slow calls, and choices that were replaced."""
 
 from __future__ import annotations
 
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from typing import Any
 
 import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from rosafe.declarations.parameter import Parameter
 from rosafe.dsp.plugin_checks import plugin_of
-from rosafe.ros1.afe.choice_fallbacks import ChoiceFallbacks
+from rosafe.interface.remarks import short_window
 from rosafe.ros1.component.activities import TaskStatistics
+from rosafe.ros1.transport import master
 from rosafe.ros1.transport.log_throttle import ThrottledLog
 from rosafe.tree.processor import Processor
-from rosafe.tree.processor_registry import Failure
 from rosafe.tree.states import State
-from rosafe.tree.tree import Tree
+from rosafe.tree.tree import Failure, Tree
 
 SLOW_SECONDS = 1.0  # a call of a stage is slow if it takes longer than this,
 SLOW_BLOCKS = 10.0  # and longer than this many lengths of its block
 SHOWN_SECONDS = 60.0  # for which a slow call is reported after its end
 FAILED, SLOW = "failed", "slow"  # keys in /diagnostics, before the name of the processor
 NEXT_STEP = "correct it, restart rosAFE if it is a plugin, and request it again"
+STRICT_CHOICES_PARAM = "~strict_words"  # ROS parameter, read for each unknown choice
 LOG_SECONDS = 60.0  # between two lines about one processor
 
 
@@ -90,6 +93,70 @@ def _block_seconds(processor: Processor) -> float:
 
 def _is_slow(processor: Processor, seconds: float) -> bool:
     return seconds > max(SLOW_SECONDS, SLOW_BLOCKS * _block_seconds(processor))
+
+
+class ChoiceFallbacks:
+    """Unknown choices in requests: replaced as in the original, with a warning, or rejected in strict mode.
+
+    Parameters
+    ----------
+    strict : bool
+        Reject unknown choices, whatever the value of the ROS parameter.
+    """
+
+    def __init__(self, strict: bool) -> None:
+        self._strict = strict
+        self._warnings: dict[Processor, dict[str, str]] = {}  # by the name of the parameter
+        self._checked_windows: set[Processor] = set()
+        self._lock = threading.Lock()
+
+    def resolving(self, warnings: dict[str, str]) -> Callable[[Parameter, Any], Any]:
+        """Return a function that replaces unknown choices, except in strict mode, and adds a warning to `warnings`."""
+
+        def resolve(parameter: Parameter, value: Any) -> Any:
+            warnings[parameter.name] = warning = parameter.substitution_warning(value)
+            return value if warning and self._is_strict() else parameter.resolve_choice(value)
+
+        return resolve
+
+    def _is_strict(self) -> bool:
+        try:
+            return self._strict or bool(rospy.get_param_cached(STRICT_CHOICES_PARAM, False) == 1)  # true, or 1
+        except master.FAILURES:
+            return False
+
+    def note(self, processor: Processor, warnings: dict[str, str]) -> str:
+        """Log and store the `warnings` about parameters of a processor, and return them as one line."""
+        with self._lock:
+            stored = {**self._warnings.pop(processor, {}), **warnings}
+            if any(stored.values()):
+                self._warnings[processor] = {name: warning for name, warning in stored.items() if warning}
+        lines = [f"{processor.name}: {warning}" for warning in warnings.values() if warning]
+        for line in [*lines, *self._window_warnings(processor)]:
+            rospy.logwarn(line)
+        return "; ".join(lines)
+
+    def _window_warnings(self, processor: Processor) -> list[str]:
+        """Return the warning about a window that is too short for the pitch range, once for each processor."""
+        if processor.kind != "pitch" or processor.parent is None or processor in self._checked_windows:
+            return []
+        with self._lock:
+            self._checked_windows.add(processor)
+        window = processor.parent.stage.parameters["ac_wSizeSec"]
+        text = short_window(processor.stage.parameters["pi_rangeHz"], window)
+        return [f"{processor.name}: {text}"] if text else []
+
+    def forget(self, processor: Processor) -> None:
+        """Remove the warnings of a processor that has ended."""
+        with self._lock:
+            self._warnings.pop(processor, None)
+            self._checked_windows.discard(processor)
+
+    @property
+    def lines(self) -> list[str]:
+        """The warnings about the current parameters of all processors."""
+        with self._lock:
+            return [f"{p.name}: {warning}" for p, warnings in self._warnings.items() for warning in warnings.values()]
 
 
 class ProcessorHealth:

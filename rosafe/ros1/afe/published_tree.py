@@ -7,9 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError
-from rosafe.ros1.afe.choice_fallbacks import ChoiceFallbacks
-from rosafe.ros1.afe.ports import OutputPort, OutputPorts, element
-from rosafe.ros1.afe.processor_health import ProcessorHealth
+from rosafe.ros1.afe.ports import OutputPort, OutputPorts
+from rosafe.ros1.afe.processor_health import ChoiceFallbacks, ProcessorHealth
 from rosafe.ros1.component import serialization
 from rosafe.ros1.component.activities import Activity
 from rosafe.ros1.component.component import ComponentNode
@@ -17,8 +16,7 @@ from rosafe.ros1.component.frame_clock import LinearClock
 from rosafe.ros1.transport.publisher import NewestMessage, Publisher
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor, next_output
-from rosafe.tree.processor_registry import Failure
-from rosafe.tree.tree import Tree
+from rosafe.tree.tree import Failure, Tree
 
 MAX_TIME = 2**32 - 1.0  # s since 1970, of a ROS time
 
@@ -141,7 +139,7 @@ class PublishedTree:
 
     def _advertise(self, kind: str, name: str = "") -> Publisher:
         message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
-        publisher = self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
+        publisher = self._node.advertise(KINDS[kind].port, message_class, name)
         publisher.impl.on_connection = self._catch_up
         publisher.impl.on_subscribers_changed = self._ports.forget_subscribed
         return publisher

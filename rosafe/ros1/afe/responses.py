@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from rosafe.declarations import ros_names
 from rosafe.interface import CORE_REPRESENTATIONS, format_value, ros_type
 from rosafe.interface.rosafe import parameter_struct
-from rosafe.ros1.afe.ports import element, signal_fields
+from rosafe.ros1.afe.ports import signal_fields
 from rosafe.ros1.component import serialization
 from rosafe.tree.processor import Processor
 
@@ -69,7 +70,7 @@ def _description(processor: Processor, node: str, input_values: Mapping[str, Any
         "request": kind.request,
         "upperDepName": "" if processor.parent is None else processor.parent.name,
         "port": kind.port,
-        "topic": "/".join(filter(None, (node, kind.port, element(kind.kind, processor.name)))),
+        "topic": ros_names.port_topic(node, kind, processor.name),
         "rate": processor.rate,
         "shape": list(processor.output_shapes[largest]),
         "axes": list(kind.parts[largest].axes[:-1]),

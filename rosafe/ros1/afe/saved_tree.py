@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,15 @@ import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.declarations import ros_names
-from rosafe.interface import RESTORED_PARAM, ROSAFE, ComponentError, Representation
+from rosafe.interface import MAX_SETUP, RESTORED_PARAM, ROSAFE, ComponentError
 from rosafe.ros1.afe.audio_input import AudioInput
-from rosafe.ros1.afe.tree_state_file import TreeStateFile
-from rosafe.ros1.component.activities import Activities, Handler
 from rosafe.ros1.transport import master, registration
-from rosafe.setups import Setup, SetupProcessor, dry_run
-from rosafe.tree.tree import Tree
+from rosafe.setups import Setup, SetupError, dry_run, plan, read, write
+from rosafe.system.input import read_regular
+from rosafe.system.output import OutputError, write_whole
+from rosafe.system.terminal import printable
+from rosafe.tree.tree_builder import Planner
+from rosafe.tree.tree_planner import ExistingProcessor, TreePlan, searched
 
 POLL_SECONDS = 0.1  # between two checks whether there is audio for the tree to restore
 
@@ -31,6 +34,74 @@ def _announce(names: list[str]) -> None:
         rospy.set_param(f"~{RESTORED_PARAM}", value)
 
 
+class TreeStateFile:
+    """A setup file (docs/setups.md) that is complete at any time, even if the process is killed or the power fails.
+
+    Parameters
+    ----------
+    path : Path
+    describe : callable
+        Returns the setup to save.
+    report : callable
+        Called with one line for the log if the file cannot be written; again only after a success.
+
+    Attributes
+    ----------
+    problem : str
+        Why the file could not be written the last time.
+    absent : str
+        Which of the saved processors cannot be built because plugins are missing.
+    """
+
+    def __init__(self, path: Path, describe: Callable[[], Setup], report: Callable[[str], None]) -> None:
+        self.path = path
+        self.problem = ""
+        self.absent = ""
+        self._describe = describe
+        self._report = report
+        self._written = ""
+        self._closed = False
+        self._lock = threading.Lock()
+
+    def saved(self) -> Setup:
+        """Return the setup in the file; an empty one if the file does not exist. Raises ComponentError."""
+        try:
+            self._written = read_regular(self.path, 4 * MAX_SETUP + 1).decode()
+            absent: list[str] = []
+            setup = read(self._written, absent)
+            if absent:
+                copy = self.path.with_name(f"{self.path.name}.complete")
+                write_whole(copy, self._written.encode())
+                self.absent = f"left out of the tree: {', '.join(absent)}; {searched()}; {copy} contains all of it"
+            return setup
+        except FileNotFoundError:
+            return Setup()
+        except (OSError, OutputError, UnicodeDecodeError, SetupError) as problem:
+            why = getattr(problem, "strerror", None) or problem
+            what = f"{self.path}: {why}; correct the file, or delete it to start with an empty tree"
+            raise ROSAFE.error("e_badNewValue", what=printable(what)) from None
+
+    def save(self) -> None:
+        """Write all changes made so far to the file, if there are any. A failure is only reported."""
+        with self._lock:  # after waiting here, the change has usually been written by the previous thread
+            text = "" if self._closed else write(self._describe(), full=True)
+            if text in ("", self._written):
+                return
+            try:
+                write_whole(self.path, text.encode())
+                self._written, self.problem = text, ""
+            except OutputError as failure:
+                problem = printable(failure)  # ROS messages cannot contain bytes that are not UTF-8
+                if not self.problem:
+                    self._report(f"the tree is not kept: {problem}")
+                self.problem = problem
+
+    def close(self) -> None:
+        """Ignore later calls of `save`."""
+        with self._lock:
+            self._closed = True
+
+
 class SavedTree:
     """The tree of a node in a file.
 
@@ -39,29 +110,26 @@ class SavedTree:
     path : Path or None
         The file; None to save nothing.
     audio : AudioInput
-    tree : Tree
-    processors : callable
-        Returns the current processors.
-    activities : Activities
-        Of the node.
-    handler : callable
-        Returns the handler that creates a processor of a kind.
+    describe : callable
+        Returns the current tree and its connection.
+    build : callable
+        Executes a plan of processors to create: see `rosafe.tree.tree_builder`.
+    is_requested : callable
+        Returns whether another client is about to create an input.
     """
 
     def __init__(
         self,
         path: Path | None,
         audio: AudioInput,
-        tree: Tree,
-        processors: Callable[[], tuple[SetupProcessor, ...]],
-        activities: Activities,
-        handler: Callable[[Representation], Handler],
+        describe: Callable[[], Setup],
+        build: Callable[[Planner], object],
+        is_requested: Callable[[], bool],
     ) -> None:
         self._audio = audio
-        self._tree = tree
-        self._processors = processors
-        self._activities = activities
-        self._handler = handler
+        self._describe = describe
+        self._build = build
+        self._is_requested = is_requested
         self._file = None if path is None else TreeStateFile(path, self._setup, rospy.logerr)
         saved = Setup() if self._file is None else self._file.saved()
         if self._file is not None and self._file.absent:
@@ -86,14 +154,13 @@ class SavedTree:
             self._file.close()
 
     def discard(self) -> None:
-        """Give up the restoration because another tree was requested."""
+        """Give up the restoration because there is another tree, or because the tree is restored."""
         self._pending = Setup()
 
     def _setup(self) -> Setup:
         """Return the current tree, or the one that is still to be restored, with the current connection."""
-        topic = self._audio.topic
-        connections = {"Audio": ros_names.relative(topic, rospy.get_name())} if topic else {}
-        return Setup(self._sound, connections, self._pending.processors or self._processors())
+        now = self._describe()
+        return replace(now, sound=self._sound, processors=self._pending.processors or now.processors)
 
     def restore(self, finished: threading.Event) -> None:
         """Connect to the saved topic, and start a thread that restores the tree; it ends when `finished` is set."""
@@ -111,43 +178,30 @@ class SavedTree:
     def _restore(self, finished: threading.Event) -> None:
         """Build the tree as soon as there is audio with a suitable sample rate."""
         tried: set[int] = set()
-        while self._pending.processors and not finished.wait(POLL_SECONDS):
+        setup = self._pending
+
+        def plan_if_pending(found: Sequence[ExistingProcessor]) -> TreePlan:
+            if self._pending is not setup:
+                raise ComponentError("::genom::interrupted", by="InputProc")
+            return plan(setup, found)
+
+        while self._pending is setup and not finished.wait(POLL_SECONDS):
             rate = self._audio.ring.sample_rate
-            requested = any(activity.service.name == "InputProc" for activity in self._activities.live())
-            if rate == 0 or rate in tried or requested:
+            if rate == 0 or rate in tried or self._is_requested():
                 continue
             tried.add(rate)
             try:
-                dry_run(self._pending, rate)
-                self._build(self._pending)
+                dry_run(setup, rate)
+                self._build(plan_if_pending)
             except ComponentError as problem:
                 self._waiting_for = str(problem)
-                if self._pending.processors:  # otherwise another tree was requested
+                if self._pending is setup:  # otherwise another tree was requested
                     rospy.logerr(f"cannot restore the tree of {self._file and self._file.path}: {problem}")
             else:
-                rospy.loginfo(f"{len(self._pending.processors)} processors are restored")
+                rospy.loginfo(f"{len(setup.processors)} processors are restored")
                 self._waiting_for = ""
                 self.discard()
                 self.save()
-
-    def _build(self, setup: Setup) -> None:
-        try:
-            for processor in setup.processors:
-                kind = processor.representation
-                values = {
-                    "name": processor.name,
-                    "upperDepName": processor.parent,
-                    **processor.values,
-                    **processor.input_values,
-                }
-                activity = self._activities.start(ROSAFE.service(kind.request), self._handler(kind), values, None)
-                activity.begun.wait()
-                if activity.error is not None:
-                    raise activity.error
-        except ComponentError:
-            if self._pending is setup:
-                self._tree.stop()
-            raise
 
     def report(self, status: Any) -> Any:
         """Fill in a status of /diagnostics."""

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import rospy
 from std_msgs.msg import String
 
-from rosafe.tree.context import Observer
+from rosafe.tree.processor import Observer
 from rosafe.tree.trace import Event, Tracer
 
 PERIOD = 0.1  # seconds between two messages

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,14 +14,11 @@ from rosafe.declarations import plugins
 from rosafe.declarations.signals import LEVELS
 from rosafe.declarations.text import did_you_mean
 from rosafe.interface import (
+    BLOCK_AND_BUFFERS,
     COMPONENTS,
-    FIND,
     KINDS,
-    LOAD_SETUP,
     PLUGINS,
-    REQUEST,
     ROSAFE,
-    SAVE_SETUP,
     ComponentError,
     ComponentSpec,
     PortSpec,
@@ -29,7 +26,7 @@ from rosafe.interface import (
     ros_type,
 )
 from rosafe.interface.rosafe import WHOLE_TREES
-from rosafe.ros1.client import installed_components, setup_transaction
+from rosafe.ros1.client import installed_components, whole_trees
 from rosafe.ros1.client.actions import ActionClient, Goal
 from rosafe.ros1.client.asyncio_tools import run_shared
 from rosafe.ros1.client.description import describe_component
@@ -46,7 +43,7 @@ from rosafe.ros1.client.tcpros import (
 )
 from rosafe.ros1.client.values import complete, partial
 from rosafe.ros1.component import explicit_defaults
-from rosafe.tree import tree_builder
+from rosafe.tree.tree_planner import ExistingProcessor
 
 CALL_SECONDS = 60.0  # for the answer to one request
 APPEAR_SECONDS = 2.0  # that `load` waits for a component that is starting
@@ -54,12 +51,6 @@ POLL_SECONDS = 0.1
 REGISTER_SECONDS = 20.0  # to become a client of an action, including becoming a node the first time
 RESULT_GRACE_SECONDS = 0.5  # for results that a component sent before it ended
 MAX_PENDING = 1000  # unanswered requests to one component
-_CLIENT_SIDE_SERVICES = {
-    REQUEST.name: tree_builder.build,
-    FIND.name: tree_builder.find,
-    SAVE_SETUP.name: setup_transaction.save,
-    LOAD_SETUP.name: setup_transaction.load,
-}
 
 
 class Value:
@@ -119,7 +110,7 @@ class Call:
         return self.service is not None and self.service.activity
 
     async def run(self) -> Value:
-        """Return the result; that of an activity when it has started, with its outputs if it has ended by then."""
+        """Return the result: for an activity when it has started, with its outputs if it has ended by then."""
         if self.service is not None:
             return await self.client.call(self.service, self.values)
         assert self.port is not None
@@ -151,7 +142,6 @@ class ComponentClient:
         self._actions: dict[str, asyncio.Task[ActionClient]] = {}
         self._readers: dict[str, TopicReader] = {}
         self._link: asyncio.Task[None] | None = None
-        self.turns = tree_builder.Turns()
         self.pending = 0  # unanswered requests
         self.used_at = self.answered_at = asyncio.get_running_loop().time()
 
@@ -236,11 +226,11 @@ class ComponentClient:
             return await self._call_action(service, values)
         with self._count_pending():
             if service in self.component.client_side_services:
-                takes_turns = service == LOAD_SETUP  # it acquires the lock itself
-                async with contextlib.nullcontext() if takes_turns else self.turns.turn():
-                    outputs = await _CLIENT_SIDE_SERVICES[service.name](self, values)
-                return Value(self.component, service.outputs, outputs)
-            response = await self._client(service.name).call(values, CALL_SECONDS)
+                return Value(self.component, service.outputs, await whole_trees.call(self, service.name, values))
+            return await self._call_node(service, values)
+
+    async def _call_node(self, service: Service, values: Mapping[str, Any]) -> Value:
+        response = await self._client(service.name).call(values, CALL_SECONDS)
         if not response.genom_success:
             raise component_exception(response.genom_exdetail)
         value = Value(self.component, service.outputs, {name: getattr(response, name) for name, _ in service.outputs})
@@ -264,14 +254,35 @@ class ComponentClient:
     async def start(self, service: Service, values: Mapping[str, Any]) -> Goal:
         """Start an activity; the state of its goal reports when it runs and when it has ended."""
         with self._count_pending():
-            if service.name in {KINDS[kind].request for kind in PLUGINS}:
-                await self._client(service.name).check()  # the node may not have the plugin, or another version of it
+            await self.check_plugins([service.name])
             await self._watch()
             return await (await self._action(service.name)).send(values)
+
+    async def check_plugins(self, requests: Iterable[str]) -> None:
+        """Raise ComponentError if the node has not the same version of a plugin that has one of these `requests`."""
+        for request in {KINDS[kind].request for kind in PLUGINS}.intersection(requests):
+            await self._client(request).check()
 
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """Call a service and return its outputs."""
         return (await self.call(self.service(service), values)).values
+
+    async def node_outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Call a service in its form as a ROS service, and return its outputs."""
+        return (await self._call_node(self.component.service(service), values)).values
+
+    async def processors(self) -> list[ExistingProcessor]:
+        """Return all processors of a rosAFE whose kind is known here."""
+        found = []
+        for processor in (await self.outputs("getProcessors", {}))["processors"]:
+            kind = KINDS.get(processor["kind"])
+            if kind is not None:
+                texts = {entry["name"]: entry["value"] for entry in processor["parameters"]}
+                declared = kind.parameters if kind.parent else (*kind.parameters, *BLOCK_AND_BUFFERS)
+                values = {p.name: p.parse(texts[p.name]) for p in declared if p.name in texts}
+                parent, rate = processor["upperDepName"], float(processor["rate"])
+                found.append(ExistingProcessor(processor["name"], kind.kind, parent, values, rate))
+        return found
 
     async def port_connected(self, port: str) -> str:
         """Return the topic that an input port is connected to; empty if it is not connected.

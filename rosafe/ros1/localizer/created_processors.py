@@ -7,11 +7,10 @@ from collections.abc import Iterable
 
 import rospy
 
-from rosafe.interface import RESTORED_PARAM
+from rosafe.interface import RESTORED_PARAM, ComponentError
 from rosafe.ros1.client.component_client import ComponentClient
 from rosafe.ros1.client.graph import Graph, NotRegisteredError
 from rosafe.ros1.transport import registration
-from rosafe.tree import tree_builder
 
 
 class CreatedProcessors:
@@ -66,8 +65,9 @@ class CreatedProcessors:
 
     async def remove(self, graph: Graph, client: ComponentClient) -> None:
         """Remove them from rosAFE, except those with children of other clients."""
-        await tree_builder.remove(client, self.names)
-        await self.keep(graph, (processor.name for processor in await tree_builder.list_processors(client)))
+        with contextlib.suppress(ComponentError):
+            await client.node_outputs("removeUnused", {"names": self.names})
+        await self.keep(graph, (processor.name for processor in await client.processors()))
         if not self.names:
             registration.registrar().parameters.pop(self._parameter, None)
             with contextlib.suppress(NotRegisteredError):

@@ -31,7 +31,6 @@ from rosafe.ros1.localizer.status import OK, WARN, NodeStatus
 from rosafe.ros1.transport import registration
 from rosafe.ros1.transport.log_throttle import ThrottledLog
 from rosafe.system.terminal import printable
-from rosafe.tree import tree_builder
 from rosafe.tree.tree_planner import ExistingProcessor
 
 BLOCK_SECONDS = 0.05  # block of a new input, rounded to a multiple of the hop: 2205 frames at 44.1 kHz
@@ -200,7 +199,7 @@ class TreeLink:
         except NotRegisteredError:  # it ends, or the master has restarted
             raise _Waiting(f"waiting for rosAFE: {self._instance} is not registered at the master") from None
         await self._created.recall(graph, self._instance, node)
-        if processors := await tree_builder.list_processors(client):  # otherwise a tree may still be restored
+        if processors := await client.processors():  # otherwise a tree may still be restored
             await self._created.keep(graph, (processor.name for processor in processors))
 
     async def _establish(self, graph: Graph, client: ComponentClient) -> Link:
@@ -216,7 +215,7 @@ class TreeLink:
                 names |= set(answer.dependencies)
         finally:
             service.close()
-        processors = {p.name: p for p in await tree_builder.list_processors(client)}
+        processors = {p.name: p for p in await client.processors()}
         missing = names - processors.keys()
         root = _input_of(processors.values())
         if missing or root is None or root.name not in names or root.rate != rate:
@@ -231,10 +230,10 @@ class TreeLink:
     async def _model_of_input(self, graph: Graph, service: ServiceClient, client: ComponentClient) -> DirectionModel:
         """Return the model for the input, which is created if there is none, or if the rate of the sound differs."""
         for _ in range(2):
-            root = _input_of(await tree_builder.list_processors(client))
+            root = _input_of(await client.processors())
             if root is None:
                 model = await self._model(await self._wait_for_sound(client))
-                if await tree_builder.list_processors(client):  # meanwhile: a tree was restored
+                if await client.processors():  # meanwhile: a tree was restored
                     continue
                 hop = FrameGrid.design(model.sample_rate, "cc", model.parameters).hop
                 frames = hop * max(1, round(BLOCK_SECONDS * model.sample_rate / hop))
@@ -305,7 +304,7 @@ class TreeLink:
             rate = await self._sound_rate(client)
             if rate and rate != self._rate:
                 raise _Waiting(f"the sample rate of the sound has changed from {self._rate:g} to {rate} Hz")
-        found = {p.name: p for p in await tree_builder.list_processors(client)}
+        found = {p.name: p for p in await client.processors()}
         if _input_of(found.values()) is None:
             raise _Waiting(STOPPED)
         for name, expected in self._watched.items():

@@ -55,7 +55,7 @@ published_tree.Tree.add_input = stall_adding
 
 class Lock:  # signals that a thread has to wait
     def __init__(self):
-        self.lock = threading.Lock()
+        self.lock = threading.RLock()
     def __enter__(self):
         if not self.lock.acquire(blocking=False):
             (folder / "waits").touch()
@@ -63,12 +63,11 @@ class Lock:  # signals that a thread has to wait
     def __exit__(self, *_):
         self.lock.release()
 
-start = node.ComponentNode.start
-def with_lock(component):
-    for owner in component._dispatcher._registered["InputProc"].handler.__self__,:
-        owner._starting = Lock()
-    start(component)
-node.ComponentNode.start = with_lock
+create = published_tree.Tree.__init__
+def with_lock(tree, *arguments, **options):
+    create(tree, *arguments, **options)
+    tree.lock = Lock()
+published_tree.Tree.__init__ = with_lock
 sys.exit(node.main())
 """
 

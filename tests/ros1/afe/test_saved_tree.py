@@ -19,13 +19,12 @@ import rospy
 import yaml
 from diagnostic_updater import DiagnosticStatusWrapper
 
-from rosafe.interface import ComponentError, Service
+from rosafe.interface import ComponentError
 from rosafe.ros1.afe.audio_input import AudioInput
 from rosafe.ros1.afe.saved_tree import SavedTree
-from rosafe.ros1.component.activities import Activities
 from rosafe.ros1.transport import registration
-from rosafe.setups import read
-from rosafe.tree.tree import Tree
+from rosafe.setups import Setup, read
+from rosafe.tree.tree_builder import Planner
 from tests.harness import PATIENCE, Graph, MasterProcess, wait_for
 from tests.ros1.afe.session import Microphone, Session, noise, own_node
 
@@ -130,10 +129,10 @@ def test_the_tree_survives_a_clean_end_but_not_stop_or_a_new_input(graph: Graph,
 
 
 @pytest.mark.parametrize("master", ["answers", "away", "hangs"])
-def test_a_tree_that_cannot_be_restored_completely_is_removed(
+def test_a_tree_that_cannot_be_restored_stays_in_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, master: str
 ) -> None:
-    """The second processor is refused although the check before accepted it, as if the memory were used meanwhile."""
+    """It is refused although the check before accepted it, as if the memory were used meanwhile."""
     ended = threading.Event()
 
     def set_param(name: str, value: object) -> None:
@@ -145,31 +144,26 @@ def test_a_tree_that_cannot_be_restored_completely_is_removed(
     monkeypatch.setattr(rospy, "set_param", set_param)
     file = tmp_path / "tree.yaml"
     file.write_text("processors:\n  input: {kind: input}\n  preProc: {kind: preProc, parent: input}\n")
-    begun = threading.Event()
-    begun.set()
-    started: list[str] = []
-    stopped = threading.Event()
+    planned: list[list[str]] = []
 
-    def start(service: Service, *_: Any) -> SimpleNamespace:
-        started.append(service.name)
-        error = ComponentError("::rosAFE::e_memory") if service.name == "PreProc" else None
-        return SimpleNamespace(begun=begun, error=error)
+    def build(planner: Planner) -> None:
+        planned.append(planner([]).created)
+        raise ComponentError("::rosAFE::e_memory")
 
     monkeypatch.setattr(registration, "_registrar", SimpleNamespace(parameters={}))
     saved = SavedTree(
         file,
         cast(AudioInput, SimpleNamespace(topic="", ring=SimpleNamespace(sample_rate=44100))),
-        cast(Tree, SimpleNamespace(stop=stopped.set)),
-        tuple,
-        cast(Activities, SimpleNamespace(live=tuple, start=start)),
-        cast(Any, lambda kind: None),
+        Setup,
+        build,
+        lambda: False,
     )
     finished = threading.Event()
     saved.restore(finished)
     try:
-        assert stopped.wait(PATIENCE)
         wait_for(lambda: "e_memory" in saved.report(DiagnosticStatusWrapper()).message)
-        assert started == ["InputProc", "PreProc"]
+        assert planned == [["input", "preProc"]]
+        saved.save()
         assert [one.name for one in read(file.read_text()).processors] == ["input", "preProc"]
     finally:
         finished.set()

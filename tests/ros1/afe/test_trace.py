@@ -25,7 +25,7 @@ from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.ros1.afe import trace_port
 from rosafe.ros1.afe.trace_port import TracePort, read
 from rosafe.ros1.component import startup
-from rosafe.tree.context import Observer
+from rosafe.tree.processor import Observer
 from rosafe.tree.states import State
 from tests.commands.command import refused, rosafe
 from tests.harness import PATIENCE, SCRIPTS, Graph, wait_for

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+from rosafe.setups import read
 from tests.harness import Graph, run_together
 from tests.ros1.afe.session import RATE, Microphone, Session, noise, own_node
 
@@ -127,28 +128,19 @@ def test_without_audio_nothing_is_created(graph: Graph) -> None:
         microphone.close()
 
 
-HOSTILE = {
-    "!!python/object/apply:os.system ['touch MARK']": "tags",
+HOSTILE = {  # all others: tests/setups
     "fb_nChannels: !!python/object/apply:os.system ['touch MARK']": "tags",
     "fb_cfHz: &a [100, 200], rm_wname: *a": "anchors",
-    "<<: {fb_nChannels: 4}": "unknown '<<'",
-    "[" * 100_000: "nested too deeply",
     "{fb_cfHz: " * 20_000: "nested too deeply",
-    "fb_nChannels: 4} {a: b": "not YAML",
-    "fb_nChannels: 4\n---\nfb_nChannels: 5": "second document",
-    "fb_nChannels: 4, fb_nChannels: 5": "twice",
+    '{"fb_nChannels": 4, "fb_nChannels": 5}': "twice",
+    '{"fb_nChannels": 4000}': "fb_nChannels: expected a number from 0 to 1024, got 4000",
+    '{"fb_nChannel": 4}': "did you mean fb_nChannels?",
     "- fb_nChannels": "not YAML",
-    "fb_nChannels: 4\nno": "not YAML",
     "fb_nChannels: ": "one value",
-    "fb_nChannels: {a: 1}": "one value",
     "fb_nChannels: .inf": "fb_nChannels",
-    "fb_nChannels: 4; pi_rangeHz: [1]": "not YAML",
-    "fb_lowFreqHz: __import__('os').getpid()": "fb_lowFreqHz",
-    "fb_cfHz: [" + "100," * 2000 + "]": "expected at most",
     "x" * 300_000: "characters",
     "representation: ild": "unknown 'representation'",
     "fb_nChannel: 4": "did you mean fb_nChannels?",
-    "fb_nChannels=4": "unknown 'fb_nChannels=4'",
     "rm_wname: hanning_": "one of",
 }
 
@@ -165,6 +157,46 @@ def test_unknown_representations(afe: Session) -> None:
     ex, what = why(afe, representation="pich")
     assert ex == "::rosAFE::e_badNewValue" and "pitch" in what and "did you mean pitch?" in what
     assert why(afe)[0] == ex
+
+
+def test_find_and_remove_unused(afe: Session) -> None:
+    sounding(afe)
+    assert afe.refused("find", representation="time")[0] == "::rosAFE::e_noSuchProcessor"
+    created = afe.ok("request", representation="ild", parameters=f"{BLOCK}, fb_nChannels: 4").created
+    found = afe.ok("find", representation="ild", parameters="fb_nChannels: 4")
+    assert (found.reused, found.created, found.topic) == (created, [], f"/{afe.name}/ildPort/ild_0")
+    afe.ok("PreProc", name="mine", upperDepName="input_0")
+    assert afe.ok("removeUnused", names=created).removed == created[:0:-1]
+    assert tree(afe) == {"input_0": "", "mine": "input_0"}
+    afe.wait_activities(["InputProc", "PreProc"])
+
+
+def test_a_setup_is_built_by_the_node_completely_or_not_at_all(graph: Graph) -> None:
+    """It connects the port; if a processor is refused, the previous topic is connected again."""
+    with own_node(graph, name="loading") as afe:
+        first, second = Microphone(graph), Microphone(graph, sample_rate=20000)
+        text = "processors:\n  input: {kind: input, nFramesPerBlock: 1600}\n  preProc: {kind: preProc}\n"
+        bank = "  bank: {kind: gammatone, parent: preProc, fb_highFreqHz: 9000}\n"
+        for microphone in (first, second):
+            microphone.play(noise(400))
+        setup = f"connections: {{Audio: {first.topic}}}\n{text}"
+        assert afe.ok("loadSetup", setup=setup, check=True).created == ["input", "preProc"]
+        assert (tree(afe), read(afe.ok("saveSetup").setup).connections) == ({}, {})
+        assert afe.ok("loadSetup", setup=setup).created == ["input", "preProc"]
+        assert afe.ok("loadSetup", setup=setup).reused == ["input", "preProc"]
+        assert read(afe.ok("saveSetup").setup).processors == read(text).processors
+        other = setup.replace(first.topic, second.topic)
+        ex, detail = afe.refused("loadSetup", setup=other)
+        assert ex == "::rosAFE::e_existsAlready" and f"the tree is connected to {first.topic}" in detail["what"]
+        afe.ok("Stop")
+        assert afe.refused("loadSetup", setup=f"{other}{bank.replace('9000', '15000')}")[0] == "::rosAFE::e_badNewValue"
+        saved = read(afe.ok("saveSetup", full=True).setup)
+        assert (saved.processors, dict(saved.connections)) == ((), {"Audio": first.topic.removeprefix("/")})
+        assert afe.ok("loadSetup", setup=f"{other}{bank}").created == ["input", "preProc", "bank"]
+        afe.wait_activities(["InputProc", "PreProc", "GammatoneProc"])
+        assert "line 2" in afe.refused("loadSetup", setup="processors:\n  a: {kind: x}")[1]["what"]
+        first.close()
+        second.close()
 
 
 def test_the_same_tree_at_the_same_time(afe: Session) -> None:

@@ -1,1 +1,1 @@
-"""Tests of the request for a whole tree, without ROS: rosafe.tree.tree_planner and rosafe.tree.tree_builder."""
+"""Tests of the clients of components."""
