@@ -73,6 +73,7 @@ class AmsFeatures(FramedStage):
         doc="Amplitude modulation spectrogram",
         parent="ihc",
         axes=("ear", "channel", "filter", "time"),
+        level=20.0,
         parameters=(
             Parameter(
                 "ams_fbType",

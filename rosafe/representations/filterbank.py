@@ -48,6 +48,8 @@ class Filterbank(Stage):
         doc="Split the signal into frequency channels",
         parent="preProc",
         axes=("ear", "channel", "time"),
+        level=20.0,
+        channel_parameter="fb_cfHz",
         parameters=(
             Parameter(
                 "fb_type",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -20,6 +21,19 @@ from rosafe.dsp.stage import Stage
 
 CONFIDENCE_SECONDS = 5.0  # time over which the greatest confidence is determined
 MAX_ORDER = 99  # of the median
+MIN_PERIODS = 3.0  # of the lowest pitch in the window of the autocorrelation
+
+
+def short_window(values: Mapping[str, Any]) -> str:
+    """Return a warning if the window of the autocorrelation is too short for the pitch range; otherwise ''."""
+    lowest, seconds = min(values["pi_rangeHz"]), values["ac_wSizeSec"]
+    if lowest * seconds >= MIN_PERIODS - 1e-9:
+        return ""
+    return (
+        f"pi_rangeHz, ac_wSizeSec: a window of {seconds:g} s contains fewer than {MIN_PERIODS:g} periods of "
+        f"{lowest:g} Hz, the lowest pitch of the range; pitches below {MIN_PERIODS / seconds:.0f} Hz are unreliable "
+        'and may be reported as higher ones; for voices use rosafe.PRESETS["speech"] (--preset speech)'
+    )
 
 
 class Pitch(Stage):
@@ -44,6 +58,8 @@ class Pitch(Stage):
         parent="autocorrelation",
         axes=("ear", "feature", "time"),
         features=("pitch", "rawPitch", "confidence"),
+        background="ratemap",
+        advice=short_window,
         allow_nan=True,
         parameters=(
             Parameter(

@@ -29,6 +29,8 @@ class Ratemap(FramedStage):
         doc="Ratemap (cochleagram)",
         parent="ihc",
         axes=("ear", "channel", "time"),
+        level=10.0,
+        amplitude_choice=("rm_scaling", "magnitude"),
         parameters=(
             *frame_parameters("rm"),
             Parameter(
