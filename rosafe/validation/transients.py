@@ -126,13 +126,7 @@ for _output in ("onsetMap", "offsetMap"):
         _rate(_output, _name, _parameters, "exact silence", lambda: np.zeros((2, SECONDS * RATE)))
 
 
-@ROWS.limitation(
-    "onsetMap",
-    "defaults: 18 bursts of noise in noise 60 dB below",
-    Origin("known times"),
-    "ms",
-    criterion=ALL,
-)
+@ROWS.listed()
 def defaults_distance(process: Process) -> float:
     return worst(marked(process, bursts(), "onsetMap", {}), TIMES)
 
