@@ -16,27 +16,6 @@ from typing import Any
 
 from rosafe.system.version import VERSION as __version__
 
-__all__ = [
-    "PRESETS",
-    "Head",
-    "Localizer",
-    "Result",
-    "Resynthesizer",
-    "Stream",
-    "__version__",
-    "deltas",
-    "direction_mask",
-    "enhance",
-    "load",
-    "localize",
-    "plot",
-    "process",
-    "process_batch",
-    "resynthesize",
-    "to_db",
-    "to_xarray",
-]
-
 # Imported on first use: programs that need only ROS do not wait for numpy and scipy.
 _MODULES = {
     "Head": "rosafe.localization.head",
@@ -57,6 +36,8 @@ _MODULES = {
     "to_db": "rosafe.processing.features",
     "to_xarray": "rosafe.view.dataset",
 }
+
+__all__ = ["__version__", *_MODULES]
 
 
 def __getattr__(name: str) -> Any:

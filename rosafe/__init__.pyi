@@ -25,7 +25,7 @@ from rosafe.processing.features import to_db as to_db
 from rosafe.view.dataset import to_xarray as to_xarray
 
 __version__: str
-__all__ = ['PRESETS', 'Head', 'Localizer', 'Result', 'Resynthesizer', 'Stream', '__version__', 'deltas', 'direction_mask', 'enhance', 'load', 'localize', 'plot', 'process', 'process_batch', 'resynthesize', 'to_db', 'to_xarray']
+__all__ = ['__version__', 'Head', 'Localizer', 'PRESETS', 'Result', 'Resynthesizer', 'Stream', 'deltas', 'direction_mask', 'enhance', 'load', 'localize', 'plot', 'process', 'process_batch', 'resynthesize', 'to_db', 'to_xarray']
 
 def __getattr__(name: str) -> Any: ...
 

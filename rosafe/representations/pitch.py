@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rosafe.declarations.literature import MCLEOD_2005, MEDDIS_1997, SLANEY_1990
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.rounding import round_half_away
@@ -105,9 +104,9 @@ class Pitch(Stage):
         ),
         port_doc="pitch (Hz), rawPitch (Hz) and confidence as channels",
         references=(
-            Citation(MEDDIS_1997, "sum of the autocorrelations of all channels"),
-            Citation(SLANEY_1990, "peak of the sum"),
-            Citation(MCLEOD_2005, "first peak above a part of the highest"),
+            cite("meddis1997", "sum of the autocorrelations of all channels"),
+            cite("slaney1990", "peak of the sum"),
+            cite("mcleod2005", "first peak above a part of the highest"),
         ),
     )
     INPUT = ("ear", "channel", "lag", "time")

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import scipy.signal
 
-from rosafe.declarations.literature import BRAASCH_2013
+from rosafe.declarations.reference import LITERATURE
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.validation.comparison import (
     INDEPENDENT,
@@ -203,7 +203,9 @@ def against_model(process: Process, level: int, window: float) -> Measured:
     return Measured.of(BRAASCH_DELAYS, expected, measured, "delay of the lag (ms)", "ITD (µs)")
 
 
-MODEL = Origin("transcription of the author's program, computed with GNU Octave (docs/figures.md)", BRAASCH_2013)
+MODEL = Origin(
+    "transcription of the author's program, computed with GNU Octave (docs/figures.md)", LITERATURE["braasch2013"]
+)
 CENTROID = "largest difference of the centroid of the correlation, over delays of 1 to 8 ms"
 for _level, _window, _tolerance in ((-6, 0.02, 100.0), (-3, 0.05, 100.0)):
     ROWS.add(

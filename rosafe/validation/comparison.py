@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.declarations.literature import LITERATURE
-from rosafe.declarations.reference import Reference
+from rosafe.declarations.reference import LITERATURE, Reference
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.validation.stimuli import TALKERS, largest

@@ -10,10 +10,7 @@ from math import pi, sqrt
 import numpy as np
 import scipy.signal
 
-from rosafe.declarations.literature import (
-    MAJDAK_2022,
-    TWOEARS_2018,
-)
+from rosafe.declarations.reference import LITERATURE
 from rosafe.validation.comparison import (
     DEFINITION,
     INDEPENDENT,
@@ -286,7 +283,7 @@ def other_cutoff(factor: float) -> Disturbance:
 ROWS.add(
     "ihc",
     "dau: gain of the low-pass for tones from 250 Hz to 4 kHz",
-    Origin(f"{BUTTERWORTH}, order 2 at 1 kHz (Two!Ears)", TWOEARS_2018),
+    Origin(f"{BUTTERWORTH}, order 2 at 1 kHz (Two!Ears)", LITERATURE["twoears2018"]),
     "dB",
     0.001,
     other_cutoff(1.001),
@@ -295,7 +292,7 @@ ROWS.add(
 ROWS.add(
     "ihc",
     "dau1996: gain of the low-pass for tones from 250 Hz to 4 kHz",
-    Origin(f"{BUTTERWORTH}, order 1 at 1 kHz (`ihc_dau1996` of AMT)", MAJDAK_2022),
+    Origin(f"{BUTTERWORTH}, order 1 at 1 kHz (`ihc_dau1996` of AMT)", LITERATURE["majdak2022"]),
     "dB",
     0.001,
     other_cutoff(1.001),

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.signal
 import scipy.special
 
-from rosafe.declarations.literature import DUDA_1998, GARDNER_1995
+from rosafe.declarations.reference import LITERATURE
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization.enhancement import enhance
 from rosafe.localization.head import Head
@@ -77,7 +77,9 @@ def sphere_ratios(process: Process) -> tuple[FloatArray, FloatArray, FloatArray]
     return frequencies, right / left, (spectra[:, 1] / spectra[:, 0]).T
 
 
-SERIES = Origin("series of spherical functions for a plane wave, radius of 8.75 cm, evaluated by scipy", DUDA_1998)
+SERIES = Origin(
+    "series of spherical functions for a plane wave, radius of 8.75 cm, evaluated by scipy", LITERATURE["duda1998"]
+)
 
 
 @ROWS.listed(
@@ -157,7 +159,7 @@ def azimuth_errors(process: Process, model: str, noisy: bool) -> FloatArray:
 
 VOICES = f"a recorded voice from each of {len(DIRECTIONS)} directions of KEMAR"
 NEEDED = (KEMAR, *TALKERS)
-MEASURED_HEAD = Origin("directions of the measured impulse responses", GARDNER_1995)
+MEASURED_HEAD = Origin("directions of the measured impulse responses", LITERATURE["gardner1995"])
 
 
 @ROWS.listed(altered("azimuth + 6°", "azimuth", lambda values: values + 6.0), under_test=find)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.declarations.literature import TURGEON_2002
+from rosafe.declarations.reference import LITERATURE
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface.remarks import PRESETS
 from rosafe.validation.comparison import INDEPENDENT, Collection, Origin, Process, late
@@ -82,7 +82,7 @@ def _timed(output: str, subject: str, sound: Any, times: FloatArray, tolerance: 
     ROWS.add(
         output,
         f"preset `onsets`: {subject}",
-        Origin("known times; events common to neighbouring channels", TURGEON_2002),
+        Origin("known times; events common to neighbouring channels", LITERATURE["turgeon2002"]),
         "ms",
         tolerance,
         late(output, 4),

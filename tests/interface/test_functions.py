@@ -139,15 +139,15 @@ def test_refusals_are_those_of_process() -> None:
 def test_plugins_have_functions(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(PLUGIN)
     code = (
-        "import inspect, types, numpy as np, rosafe\n"
+        "import inspect, numpy as np, rosafe\n"
+        "from rosafe import odd, slow, view\n"
         "sound = np.random.default_rng(0).standard_normal((2, 4000))\n"
-        "assert np.array_equal(rosafe.slow(sound, 16000), rosafe.ratemap(sound, 16000, decaySec=0.1))\n"
-        "assert np.array_equal(rosafe.slow(sound, 16000, decaySec=0.008), rosafe.ratemap(sound, 16000))\n"
-        "assert 'slow' in dir(rosafe) and rosafe.slow.__doc__.startswith('Slow ratemap.')\n"
-        "print(inspect.signature(rosafe.slow).parameters['decaySec'])\n"
-        "print(*inspect.signature(rosafe.odd).parameters)\n"
-        "print(np.array_equal(rosafe.odd(sound, 16000, od_lambda=0.0), 0 * rosafe.ihc(sound, 16000)))\n"
-        "from rosafe import view\n"
+        "assert np.array_equal(slow(sound, 16000), rosafe.ratemap(sound, 16000, decaySec=0.1))\n"
+        "assert np.array_equal(slow(sound, 16000, decaySec=0.008), rosafe.ratemap(sound, 16000))\n"
+        "assert 'slow' in dir(rosafe) and slow.__doc__.startswith('Slow ratemap.')\n"
+        "print(inspect.signature(slow).parameters['decaySec'])\n"
+        "print(*inspect.signature(odd).parameters)\n"
+        "print(np.array_equal(odd(sound, 16000, od_lambda=0.0), 0 * rosafe.ihc(sound, 16000)))\n"
         "print(type(view), rosafe.process.__module__)\n"
     )
     done = python(code, tmp_path)

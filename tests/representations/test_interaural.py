@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from rosafe.dsp.signal_format import SignalFormat
-from rosafe.representations.ic import Ic
-from rosafe.representations.itd import Itd
+from rosafe.representations.itd_ic import Ic, Itd
 
 from .chain import Chain, FloatArray, process, reference
 

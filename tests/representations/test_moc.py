@@ -74,3 +74,10 @@ def test_changes_take_effect_at_once() -> None:
 def test_the_documentations_names() -> None:
     names = ("moc_mocIpsi", "moc_mocContra", "moc_mocThresholdRatedB", "moc_mocMaxAttenuationdB")
     assert [Moc.REPRESENTATION.parameter(name) for name in names] == list(Moc.REPRESENTATION.parameters)
+
+
+@pytest.mark.parametrize("name", ["moc_extIpsi", "moc_extContra"])
+def test_factors_other_than_1(name: str) -> None:
+    """They would have an effect only if the attenuation was fed back."""
+    with pytest.raises(ValueError, match=f"^{name}: expected 1, "):
+        Moc(GIVEN).configure(**{name: 0.5})
