@@ -1,4 +1,4 @@
-"""The representation of docs/own-representation.md; broken plugins are reported and left out."""
+"""Numbers of the plugin of docs/own-representation.md, and the rules of a declaration."""
 
 from __future__ import annotations
 
@@ -15,36 +15,6 @@ from .support import SHORT, python
 TEXT = (ROOT / "docs" / "own-representation.md").read_text("utf-8")
 PYTHON_BLOCKS = re.findall(r"^```python\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
 
-BROKEN = {
-    "no_such_import.py": ("import nothing_like_this", "ModuleNotFoundError"),
-    "syntax.py": ("class :", "SyntaxError"),
-    "leaves.py": ("import sys; sys.exit(3)", "SystemExit"),
-    "declared_wrong.py": (
-        "from rosafe.declarations.representation import Representation\n"
-        "Representation(kind='x', doc='x', parent='ihc', axes=('channel',))\n",
-        "time last",
-    ),
-}
-TAKEN = """
-from rosafe.dsp.stage import Stage
-from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.representation import Representation
-
-
-class Taken(Stage):
-    REPRESENTATION = Representation(kind={kind!r}, doc="x", parent={parent!r}, axes=("ear", "channel", "time"),
-        parameters=(Parameter({parameter!r}, "double", 1.0, "x", 0.0, 2.0),))
-
-    def process(self, block, extra=None):
-        return block.copy()
-"""
-CLASHES = {
-    "same_kind.py": (("ild", "ihc", "mine_x"), "ild has 'ild' already"),
-    "same_word.py": (("Ratemap", "ihc", "mine_x"), "ratemap has 'Ratemap' already"),
-    "orphan.py": (("mine", "nobody", "mine_x"), "got 'nobody'"),
-    "same_parameter.py": (("mine", "ihc", "fb_nERBs"), "'fb_nERBs'"),
-}
-
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
@@ -53,15 +23,6 @@ def folder(tmp_path: Path) -> Path:
     path.mkdir()
     (path / "zerocrossings.py").write_text(PYTHON_BLOCKS[0])
     return path
-
-
-def test_the_example_is_short() -> None:
-    assert len(PYTHON_BLOCKS[0].splitlines()) < 40
-
-
-def test_its_output(folder: Path) -> None:
-    shown = python(PYTHON_BLOCKS[1], folder).stdout
-    assert shown.startswith("(2, 31, 96) 100")
 
 
 def test_its_results(folder: Path) -> None:
@@ -79,49 +40,6 @@ print(json.dumps([result["zeroCrossings"][:, 0, k].tolist() for k in (10, 90)]))
     (left, right), (no_left, _) = json.loads(python(code, folder).stdout)
     assert left == pytest.approx(1000, abs=60)
     assert right == no_left == 0
-
-
-def test_a_stage_that_violates_the_rules_is_detected(folder: Path) -> None:
-    """The check finds state across frames that depends on block boundaries, and a late error."""
-    broken = PYTHON_BLOCKS[0].replace("crossing.sum(axis=-1)", "frames.shape[-2] + 0 * crossing.sum(axis=-1)")
-    (folder / "zerocrossings.py").write_text(broken)
-    done = python(next(code for code in PYTHON_BLOCKS if "check_representation" in code), folder)
-    assert done.returncode == 1
-    assert "AssertionError: the output depends on blocks" in done.stderr
-
-
-def test_broken_plugins_are_reported_and_left_out(folder: Path) -> None:
-    for name, (text, _) in BROKEN.items():
-        (folder / name).write_text(text)
-    for name, (words, _) in CLASHES.items():
-        kind, parent, parameter = words
-        (folder / name).write_text(TAKEN.format(kind=kind, parent=parent, parameter=parameter))
-    code = "from rosafe.representations import KINDS, PROBLEMS; import json; print(json.dumps([list(KINDS), PROBLEMS]))"
-    kinds, problems = json.loads(python(code, folder).stdout)
-    assert kinds[-1] == "zeroCrossings"
-    assert len(problems) == len(BROKEN) + len(CLASHES)
-    reasons = [(name, why) for name, (_, why) in BROKEN.items()] + [(name, why) for name, (_, why) in CLASHES.items()]
-    for name, why in reasons:
-        (line,) = [problem for problem in problems if f"/{name}: " in problem]
-        assert why in line
-        assert "\n" not in line
-
-
-def test_a_missing_folder_is_reported(tmp_path: Path) -> None:
-    done = python("from rosafe.representations import PROBLEMS; print(PROBLEMS)", tmp_path / "none")
-    assert "expected a readable folder, got: No such file" in done.stdout
-
-
-def test_an_installed_package(folder: Path, tmp_path: Path) -> None:
-    site = tmp_path / "site"
-    (site / "crossings-1.0.dist-info").mkdir(parents=True)
-    (site / "crossings.py").write_text(PYTHON_BLOCKS[0])
-    (site / "crossings-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: crossings\nVersion: 1.0\n")
-    points = "[rosafe.representations]\nzerocrossings = crossings\n"
-    (site / "crossings-1.0.dist-info" / "entry_points.txt").write_text(points)
-    code = "from rosafe.representations import KINDS, PROBLEMS; print(list(KINDS)[-1], PROBLEMS)"
-    done = python(code, folder, ROSAFE_PLUGINS="", PYTHONPATH=f"{site}:{ROOT}")
-    assert done.stdout == "zeroCrossings []\n"
 
 
 RULES = """

@@ -86,7 +86,7 @@ def frames(root: str, number: int, seed: int = 0, channels: int = 5) -> FloatArr
         made[..., rng.random(number) < 0.1] = 0.0
         return made
     if root in SOUNDS:
-        levels = np.repeat(10.0 ** rng.uniform(-3, 0, number) * (rng.random(number) < 0.9), PER_FRAME)
+        levels = np.repeat(rng.choice([0.0, 0.001, 0.03, 1.0], number), PER_FRAME)
         return np.maximum(rng.standard_normal((2, channels, number * PER_FRAME)), -0.1) * levels
     steps = rng.standard_normal((2, channels, number)) + 2 * rng.standard_normal((2, 1, number))
     made = 10 ** ((3 * steps.cumsum(axis=-1) - 60) / 10)

@@ -203,12 +203,6 @@ def test_a_figure_of_pyplot(result: dict[str, Any]) -> None:
         pyplot.close(figure)
 
 
-def test_times_in_the_result_have_priority(result: dict[str, Any], ax: Axes) -> None:
-    times = 7.0 + np.arange(result["itd"].shape[-1]) / 100
-    plot({**result, "itd_time": times}, "itd", ax)
-    assert ax.get_xlim() == pytest.approx((times[0] - 0.005, times[-1] + 0.005))
-
-
 def test_the_sample_rate(result: dict[str, Any]) -> None:
     bare = {"input": result["input"]}
     with pytest.raises(ValueError, match="sample_rate"):
