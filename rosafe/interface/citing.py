@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rosafe.declarations.parameter import format_value
@@ -15,38 +16,6 @@ FRONT_END = LITERATURE["twoears2018"]
 _WIDTH = 100  # characters of a line
 
 TITLE = "rosAFE in Python: the Two!Ears auditory front-end"
-HEAD = """# Citing rosAFE
-
-If results of rosAFE are part of a publication, please cite the software, the Two!Ears auditory front-end whose models
-it computes, and the publications of the representations in use. `rosafe cite` prints a paragraph for a methods section
-with a list of references. With a result of `rosafe process` it contains the version, the sample rate, the parameters
-and the publications that apply to them:
-
-```sh
-rosafe cite speech.npz
-rosafe cite speech.npz --bibtex > references.bib
-rosafe cite --outputs ratemap,ild --set ihc_method=breebart    # without a result
-```
-
-In Python, `result.save("speech.npz")` writes a file for `rosafe cite`. This page and `CITATION.cff` are generated from
-the declarations of the representations by `python3 -m rosafe.interface`.
-
-## The software
-
-{software}
-
-## Publications of the representations
-
-| representation | publication | subject | applies if |
-|---|---|---|---|
-{rows}
-
-## BibTeX
-
-```bibtex
-{bibtex}
-```
-"""
 
 
 def software(version: str = VERSION) -> Reference:
@@ -140,7 +109,8 @@ def bibtex(entries: Iterable[Reference]) -> str:
 def markdown(kinds: Mapping[str, Representation]) -> str:
     """Return docs/citing.md."""
     entries = [software(), *references(kinds.values(), {})]
-    return HEAD.format(
+    template = Path(__file__).with_name("citing_template.md").read_text("utf-8")
+    return template.format(
         software="\n".join(f"* {entry.text}" for entry in (software(), FRONT_END)),
         rows="\n".join(row for kind in kinds.values() for row in _rows(kind)),
         bibtex=bibtex(entries).rstrip(),
