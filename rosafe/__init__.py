@@ -43,16 +43,21 @@ __all__ = ["__version__", *_MODULES]
 def __getattr__(name: str) -> Any:
     if name in _MODULES:
         value = getattr(importlib.import_module(_MODULES[name]), name)
-    elif name.startswith("_") or importlib.util.find_spec(f"{__name__}.{name}") or name not in _kinds():
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    else:
+    elif name.isidentifier() and not (name.startswith("_") or _is_module(name)) and name in _kinds():
         value = importlib.import_module("rosafe.processing.functions").function_of(name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
     return sorted({"__doc__", *__all__, *_kinds()})
+
+
+def _is_module(name: str) -> bool:
+    """Return whether it is a module of rosafe, which is imported without the representations."""
+    return importlib.util.find_spec(f"{__name__}.{name}") is not None
 
 
 def _kinds() -> list[str]:

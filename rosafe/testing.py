@@ -64,6 +64,7 @@ def check_representation(
             trial.check_refusals(parameter)
             trial.check_change(parameter, sound)
         trial.check_channel_change(sound)
+        trial.check_advice()
         trial.check_parents(sound)
         trial.check_copy_and_reset(sound)
         trial.check_long()
@@ -232,6 +233,13 @@ class _Trial:
                             continue
                         if _fits(stages):
                             self.run(short, [500], stages)
+
+    def check_advice(self) -> None:
+        """Check that the declared advice accepts the parameters of the representation and of its parents."""
+        if advice := self.kind.REPRESENTATION.advice:
+            with _trying("advice"):
+                text = advice({name: value for stage in self.stages() for name, value in stage.parameters.items()})
+                assert isinstance(text, str), f"expected a text, got {text!r:.80}"
 
     # --- copies ---
 

@@ -34,7 +34,7 @@ def warnings_of(values: Mapping[str, Any], outputs: Collection[str]) -> list[str
 def advice(kind: str, values: Mapping[str, Any]) -> str:
     """Return the warning that a kind declares about its parameters and those of its ancestors; empty for none."""
     try:
-        return str(declared(values)) if (declared := KINDS[kind].advice) else ""
+        return " ".join(str(declared(values)).split()) if (declared := KINDS[kind].advice) else ""
     except Exception as problem:  # of a plugin
         return f"{kind}: advice: {type(problem).__name__}: {short_repr(str(problem))}"
 

@@ -178,7 +178,8 @@ class _Panel:
 
     @property
     def _decibels(self) -> float:
-        return self.kind.decibels(self.result.get("parameters") or {})
+        parameters = self.result.get("parameters")  # a text in what numpy.load returns
+        return self.kind.decibels(parameters if isinstance(parameters, Mapping) else {})
 
     # --- drawing ---
 

@@ -128,6 +128,8 @@ def test_refusals_are_those_of_process() -> None:
     assert "ild" in computed(rosafe.ild, SOUND[0], RATE)
     with pytest.raises(TypeError):
         rosafe.ratemap(SOUND, RATE, 0.01)  # type: ignore[call-arg, arg-type]
+    for name in ("ratemaps", "view.plot", "_ratemap", ""):
+        assert not hasattr(rosafe, name)
 
 
 def test_plugins_have_functions(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def test_levels_are_relative_to_the_loudest_of_both_ears(
     result: dict[str, Any], ax: Axes, name: str, decibels: int, ear: str
 ) -> None:
     magnitude = {"rm_scaling": "magnitude"} if (name, decibels) == ("ratemap", 20) else {}
-    plot({**result, "parameters": magnitude}, name, ax, ear=ear)
+    plot({**result, "parameters": magnitude or np.array("{}")}, name, ax, ear=ear)
     size = np.abs(result[name])
     level = np.maximum(decibels * np.log10(np.maximum(size, 1e-200) / size.max()), -60)[int(ear == "right")]
     if name == "ratemap":
