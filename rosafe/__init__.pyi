@@ -51,8 +51,7 @@ def input(
     normalizeValue : int, default 2147483647
         Sample value that becomes 1.0. Allowed: from 1 to 18446744073709551615.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``.
+        Accepted as by `rosafe.process`, without an effect.
 
     Returns
     -------
@@ -117,8 +116,7 @@ def preProc(
     bUnityComp : bool, default False
         Compensation to have maximum of unity gain for middle ear filter.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of input have an effect.
+        Parameters of input by their names in `rosafe.process`.
 
     Returns
     -------
@@ -176,8 +174,7 @@ def gammatone(
     bwERBs : float, default 1.018
         Bandwidth of the filters in ERBs. Allowed: above 0, at most 10000.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of preProc, input have an effect.
+        Parameters of preProc, input by their names in `rosafe.process`.
 
     Returns
     -------
@@ -213,8 +210,8 @@ def ihc(
         The IHC method name. Allowed: one of none, halfwave, fullwave, square, hilbert, joergensen, dau,
         breebart, bernstein, dau1996.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of gammatone, preProc, input have an effect.
+        Parameters of gammatone, preProc, input by their names in `rosafe.process`, such as
+        ``fb_nChannels=64``.
 
     Returns
     -------
@@ -255,8 +252,8 @@ def ild(
     hSizeSec : float, default 0.01
         Window step size (s). Allowed: above 0, at most 60.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of ihc, gammatone, preProc, input have an effect.
+        Parameters of ihc, gammatone, preProc, input by their names in `rosafe.process`, such as
+        ``fb_nChannels=64``.
 
     Returns
     -------
@@ -303,8 +300,8 @@ def ratemap(
     decaySec : float, default 0.008
         Signal-smoothing leaky integrator time constant (s). Allowed: above 0, at most 3600.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of ihc, gammatone, preProc, input have an effect.
+        Parameters of ihc, gammatone, preProc, input by their names in `rosafe.process`, such as
+        ``fb_nChannels=64``.
 
     Returns
     -------
@@ -348,8 +345,8 @@ def crossCorrelation(
     maxDelaySec : float, default 0.0011
         Maximum delay in cross-correlation computation (s). Allowed: above 0, at most 10.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of ihc, gammatone, preProc, input have an effect.
+        Parameters of ihc, gammatone, preProc, input by their names in `rosafe.process`, such as
+        ``fb_nChannels=64``.
 
     Returns
     -------
@@ -395,8 +392,8 @@ def adaptation(
         Published set that overrides the other three; empty: none. Allowed: one of adt_dau, adt_puschel,
         adt_breebaart, adt_vandorpschuitman, or empty.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of ihc, gammatone, preProc, input have an effect.
+        Parameters of ihc, gammatone, preProc, input by their names in `rosafe.process`, such as
+        ``fb_nChannels=64``.
 
     Returns
     -------
@@ -459,8 +456,8 @@ def amsFeatures(
     wname : str, default 'rectwin'
         Window name. Allowed: one of hamming, hanning, hann, blackman, triang, sqrt_win, rectwin.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of ihc, gammatone, preProc, input have an effect.
+        Parameters of ihc, gammatone, preProc, input by their names in `rosafe.process`, such as
+        ``fb_nChannels=64``.
 
     Returns
     -------
@@ -512,8 +509,8 @@ def autocorrelation(
     K : float, default 2.0
         Exponent of the magnitude spectrum; 2: ordinary autocorrelation. Allowed: above 0, at most 10.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of ihc, gammatone, preProc, input have an effect.
+        Parameters of ihc, gammatone, preProc, input by their names in `rosafe.process`, such as
+        ``fb_nChannels=64``.
 
     Returns
     -------
@@ -549,8 +546,8 @@ def gabor(
         Dynamic range (dB): levels below the maximum minus this value are raised to it. Allowed: above
         0, at most 1000.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of ratemap, ihc, gammatone, preProc, input have an effect.
+        Parameters of ratemap, ihc, gammatone, preProc, input by their names in `rosafe.process`, such
+        as ``fb_nChannels=64``.
 
     Returns
     -------
@@ -581,8 +578,8 @@ def ic(
     sample_rate : float
         In Hz.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of crossCorrelation, ihc, gammatone, preProc, input have an effect.
+        Parameters of crossCorrelation, ihc, gammatone, preProc, input by their names in
+        `rosafe.process`, such as ``fb_nChannels=64``.
 
     Returns
     -------
@@ -613,8 +610,8 @@ def itd(
     sample_rate : float
         In Hz.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of crossCorrelation, ihc, gammatone, preProc, input have an effect.
+        Parameters of crossCorrelation, ihc, gammatone, preProc, input by their names in
+        `rosafe.process`, such as ``fb_nChannels=64``.
 
     Returns
     -------
@@ -660,8 +657,8 @@ def moc(
     maxAttenuationdB : float, default 40.0
         Greatest attenuation (dB). Allowed: from 0 to 200.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of ratemap, ihc, gammatone, preProc, input have an effect.
+        Parameters of ratemap, ihc, gammatone, preProc, input by their names in `rosafe.process`, such
+        as ``fb_nChannels=64``.
 
     Returns
     -------
@@ -696,8 +693,8 @@ def offsetStrength(
     maxOffsetdB : float, default 30.0
         Upper limit of offset strength (dB). Allowed: above 0, at most 1000.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of ratemap, ihc, gammatone, preProc, input have an effect.
+        Parameters of ratemap, ihc, gammatone, preProc, input by their names in `rosafe.process`, such
+        as ``fb_nChannels=64``.
 
     Returns
     -------
@@ -743,9 +740,8 @@ def offsetMap(
         Transients are ignored if the ratemap's level is below this (dB); -2000: never. Allowed: from
         -2000 to 1000.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of offsetStrength, ratemap, ihc, gammatone, preProc, input have an
-        effect.
+        Parameters of offsetStrength, ratemap, ihc, gammatone, preProc, input by their names in
+        `rosafe.process`, such as ``fb_nChannels=64``.
 
     Returns
     -------
@@ -780,8 +776,8 @@ def onsetStrength(
     maxOnsetdB : float, default 30.0
         Upper limit of onset strength (dB). Allowed: above 0, at most 1000.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of ratemap, ihc, gammatone, preProc, input have an effect.
+        Parameters of ratemap, ihc, gammatone, preProc, input by their names in `rosafe.process`, such
+        as ``fb_nChannels=64``.
 
     Returns
     -------
@@ -827,9 +823,8 @@ def onsetMap(
         Transients are ignored if the ratemap's level is below this (dB); -2000: never. Allowed: from
         -2000 to 1000.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of onsetStrength, ratemap, ihc, gammatone, preProc, input have an
-        effect.
+        Parameters of onsetStrength, ratemap, ihc, gammatone, preProc, input by their names in
+        `rosafe.process`, such as ``fb_nChannels=64``.
 
     Returns
     -------
@@ -874,8 +869,8 @@ def pitch(
         Height of the first peak that counts, relative to the highest; below 1: fewer octaves below the
         pitch. Allowed: above 0, at most 1.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of autocorrelation, ihc, gammatone, preProc, input have an effect.
+        Parameters of autocorrelation, ihc, gammatone, preProc, input by their names in
+        `rosafe.process`, such as ``fb_nChannels=64``.
 
     Returns
     -------
@@ -916,8 +911,8 @@ def precedence(
     maxDelaySec : float, default 0.001
         Maximum delay in cross-correlation computation (s). Allowed: above 0, at most 10.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of gammatone, preProc, input have an effect.
+        Parameters of gammatone, preProc, input by their names in `rosafe.process`, such as
+        ``fb_nChannels=64``.
 
     Returns
     -------
@@ -961,8 +956,8 @@ def spectralFeatures(
     roPerc : float, default 0.8
         Part of the energy below the roll-off. Allowed: above 0, at most 1.
     **parameters
-        Parameters of the other representations by their names in `rosafe.process`, such as
-        ``fb_nChannels=64``; those of ratemap, ihc, gammatone, preProc, input have an effect.
+        Parameters of ratemap, ihc, gammatone, preProc, input by their names in `rosafe.process`, such
+        as ``fb_nChannels=64``.
 
     Returns
     -------

@@ -66,9 +66,11 @@ def documentation(kind: Representation, kinds: Mapping[str, Representation]) -> 
     for name, parameter in arguments(kind).items():
         lines += _described(name, parameter)
     lines.append("**parameters")
+    example = ", such as ``fb_nChannels=64``" if "gammatone" in others else ""
     lines += _indented(
-        "Parameters of the other representations by their names in `rosafe.process`, such as ``fb_nChannels=64``"
-        + (f"; those of {others} have an effect." if others else ".")
+        f"Parameters of {others} by their names in `rosafe.process`{example}."
+        if others
+        else "Accepted as by `rosafe.process`, without an effect."
     )
     lines += ["", "Returns", "-------"]
     lines += _returned(kind)
