@@ -147,7 +147,7 @@ FAULTS: Mapping[str, Fault] = {
         process("return block * self.weights")
         + "\n    def build(self, values, changed):"
         + "\n        self.weights = np.ones((len(self.input_format.center_frequencies), 1))",
-        "fb_nChannels",
+        "5 channels during the sound",
         at_run_time=False,
     ),
     "raises after a change": Fault(
