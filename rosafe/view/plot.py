@@ -178,7 +178,7 @@ class _Panel:
 
     @property
     def _decibels(self) -> float:
-        parameters = self.result.get("parameters")  # a text in what numpy.load returns
+        parameters = self.result.get("parameters")  # a text if numpy.load has read the file
         return self.kind.decibels(parameters if isinstance(parameters, Mapping) else {})
 
     # --- drawing ---
