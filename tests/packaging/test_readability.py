@@ -113,7 +113,7 @@ MAX_MARKED_PERCENT: dict[str, float] = {
     "rosafe/demo": 1.5,
     "rosafe/dsp": 2.0,
     "rosafe/eltclsh": 1.6,
-    "rosafe/interface": 2.9,
+    "rosafe/interface": 2.2,
     "rosafe/localization": 1.5,
     "rosafe/processing": 1.0,
     "rosafe/representations": 1.0,
