@@ -4,51 +4,17 @@
 `plot` draws them, `to_xarray` converts them to an xarray Dataset, and `load` reads result files. `to_db` and `deltas`
 compute features from them, `process_batch` processes several sounds, and `PRESETS` are parameters for a purpose.
 `resynthesize` and `Resynthesizer` return from the filterbank to sound; `enhance` selects the sound from a direction.
+Each representation, also of a plugin, has a function of its name, such as `ratemap`, which returns one array.
 docs/tutorial.md begins with a sound file.
 """
 
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+import importlib.util
+from typing import Any
 
 from rosafe.system.version import VERSION as __version__
-
-__all__ = [
-    "PRESETS",
-    "Head",
-    "Localizer",
-    "Result",
-    "Resynthesizer",
-    "Stream",
-    "__version__",
-    "deltas",
-    "direction_mask",
-    "enhance",
-    "load",
-    "localize",
-    "plot",
-    "process",
-    "process_batch",
-    "resynthesize",
-    "to_db",
-    "to_xarray",
-]
-
-if TYPE_CHECKING:
-    from rosafe.interface.remarks import PRESETS
-    from rosafe.localization.enhancement import direction_mask, enhance
-    from rosafe.localization.head import Head
-    from rosafe.localization.localize import localize
-    from rosafe.localization.localizer import Localizer
-    from rosafe.processing.features import deltas, process_batch, to_db
-    from rosafe.processing.process import process
-    from rosafe.processing.resynthesis import Resynthesizer, resynthesize
-    from rosafe.processing.stream import Stream
-    from rosafe.results.readers import load
-    from rosafe.results.result import Result
-    from rosafe.view.dataset import to_xarray
-    from rosafe.view.plot import plot
 
 # Imported on first use: programs that need only ROS do not wait for numpy and scipy.
 _MODULES = {
@@ -71,13 +37,29 @@ _MODULES = {
     "to_xarray": "rosafe.view.dataset",
 }
 
+__all__ = ["__version__", *_MODULES]
+
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
+    if name in _MODULES:
+        value = getattr(importlib.import_module(_MODULES[name]), name)
+    elif name.isidentifier() and not (name.startswith("_") or _is_module(name)) and name in _kinds():
+        value = importlib.import_module("rosafe.processing.functions").function_of(name)
+    else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(importlib.import_module(_MODULES[name]), name)
+    globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted({"__doc__", *__all__})
+    return sorted({"__doc__", *__all__, *_kinds()})
+
+
+def _is_module(name: str) -> bool:
+    """Return whether it is a module of rosafe, which is imported without the representations."""
+    return importlib.util.find_spec(f"{__name__}.{name}") is not None
+
+
+def _kinds() -> list[str]:
+    """Return the names of all representations."""
+    return list(importlib.import_module("rosafe.representations").KINDS)

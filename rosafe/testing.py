@@ -64,6 +64,7 @@ def check_representation(
             trial.check_refusals(parameter)
             trial.check_change(parameter, sound)
         trial.check_channel_change(sound)
+        trial.check_advice()
         trial.check_parents(sound)
         trial.check_copy_and_reset(sound)
         trial.check_long()
@@ -206,18 +207,16 @@ class _Trial:
 
     def check_channel_change(self, sound: FloatArray) -> None:
         """Check changes of the number of channels in the middle of the sound."""
-        stages = self.stages()
-        bank = next((i for i, stage in enumerate(stages[:-1]) if stage.REPRESENTATION.kind == "gammatone"), None)
-        if bank is None:
-            return
-        for channels in (5, 1, 40):
-            stages = self.stages()
-            half = sound.shape[-1] // 2
-            self.run(sound[:, :half], [160], stages)
-            stages[bank].configure(fb_nChannels=channels)
-            with _trying(f"fb_nChannels = {channels} during the sound"):
-                if _follow(stages[bank:]):
-                    self.run(sound[:, half:], [160, 0, 7], stages)
+        half = sound.shape[-1] // 2
+        parents = [stage.REPRESENTATION for stage in self.stages()[:-1]]
+        for bank, name in enumerate(declared.channel_parameter for declared in parents):
+            for channels in (5, 1, 40) if name else ():
+                stages = self.stages()
+                self.run(sound[:, :half], [160], stages)
+                stages[bank].configure(**{name: np.geomspace(100.0, 0.4 * self.sample_rate, channels)})
+                with _trying(f"{channels} channels during the sound"):
+                    if _follow(stages[bank:]):
+                        self.run(sound[:, half:], [160, 0, 7], stages)
 
     def check_parents(self, sound: FloatArray) -> None:
         """Check the stage with each parameter of its parents at its limits, one at a time."""
@@ -234,6 +233,13 @@ class _Trial:
                             continue
                         if _fits(stages):
                             self.run(short, [500], stages)
+
+    def check_advice(self) -> None:
+        """Check that the declared advice accepts the parameters of the representation and of its parents."""
+        if advice := self.kind.REPRESENTATION.advice:
+            with _trying("advice"):
+                text = advice({name: value for stage in self.stages() for name, value in stage.parameters.items()})
+                assert isinstance(text, str), f"expected a text, got {text!r:.80}"
 
     # --- copies ---
 

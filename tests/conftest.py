@@ -39,7 +39,6 @@ STARTING_FILES = (  # the same for single files
     "test_harness.py",
 )
 LONG_FILES = (  # dozens of seconds of computation; scripts/test --fast has others for the same code
-    "dsp/test_accuracy.py",
     "dsp/test_processors.py",
     "localization/test_audio_delay.py",
     "localization/test_commands.py",
@@ -81,7 +80,6 @@ EACH_VARIANT = 4  # of the cases of a test, each fourth is repeated with numpy, 
 EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal suite; all with scripts/test --long
     "commands/test_corpus.py::test_names_that_are_not_utf8": 2,
     "commands/test_writers.py::test_many_concurrent_writers": 2,
-    "dsp/test_accuracy.py::test_errors_are_within_their_limits": 3,
     "dsp/test_kernels.py::test_autocorrelation": 4,
     "dsp/test_processors.py::test_every_kernel": 3,
     "web/genomix/test_guide.py::test_usage_patterns_of_published_scripts": 2,

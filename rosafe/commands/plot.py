@@ -90,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
     from rosafe.processing.process import process
     from rosafe.results.formats import FORMATS
     from rosafe.view.axes import save
-    from rosafe.view.plot import BACKGROUNDS, draw
+    from rosafe.view.plot import draw
 
     names = parse_settings(options.outputs)
     result: Mapping[str, Any]
@@ -106,7 +106,7 @@ def run(options: argparse.Namespace) -> int:
         else:
             sound, rate = _sound(source, not options.no_clip)
             names = check_outputs(names) if names else _default(len(sound))
-            outputs = [*names, *(BACKGROUNDS[name] for name in names if name in BACKGROUNDS)]
+            outputs = [*names, *(KINDS[name].background for name in names if KINDS[name].background)]
             parameters = parameters_of(options.settings, options.preset)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", UserWarning)

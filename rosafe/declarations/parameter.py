@@ -8,9 +8,19 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rosafe.declarations.checks import is_number
+from rosafe.declarations.checks import (
+    bad_count,
+    bad_flag,
+    bad_name,
+    bad_optional_text,
+    bad_type,
+    duplicate,
+    each,
+    field_problems,
+    is_number,
+    tuple_problems,
+)
 from rosafe.declarations.idl import SCALARS, element
-from rosafe.declarations.parameter_checks import declaration_problems
 from rosafe.declarations.text import closest_match, did_you_mean, short_repr
 
 REQUIRED = object()  # the default of a parameter without one, such as `local` of connect_port
@@ -58,7 +68,7 @@ class Parameter:
     checked_by_client: bool = False  # for a number in the component, whose error could not name the choices
 
     def __post_init__(self) -> None:
-        for problem in itertools.chain(declaration_problems(self), self._default_problems()):
+        for problem in itertools.chain(_declaration_problems(self), self._default_problems()):
             raise ValueError(f"parameter {short_repr(self.name)}: {problem}")
 
     def _default_problems(self) -> Iterator[str]:
@@ -241,3 +251,50 @@ def format_value(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(format_value, value))}]"
     return str(value)
+
+
+# --- checks of declarations -----------------------------------------------------------------------------------------
+
+
+def _bad_spellings(value: Any) -> str:
+    if isinstance(value, Mapping) and all(isinstance(word, str) for pair in value.items() for word in pair):
+        return ""
+    return f"expected a mapping of strings to strings, got {short_repr(value)}"
+
+
+_FIELDS = {
+    "name": bad_name,
+    **dict.fromkeys(("doc", "fallback", "unit"), bad_optional_text),
+    **dict.fromkeys(("open_minimum", "zero_is_default", "follows_rate", "ascending"), bad_flag),
+    **dict.fromkeys(("least", "most", "longest"), bad_count),
+    "spellings": _bad_spellings,
+}
+
+
+def _declaration_problems(parameter: Parameter) -> Iterator[str]:
+    """Yield the reasons why `parameter` is invalid, except for its default. Lists in it become tuples."""
+    yield from field_problems(parameter, _FIELDS)
+    if not hasattr(parameter, "members") and (problem := bad_type(parameter.idl)):
+        yield f"type: {problem}"
+    scalar = element(parameter.idl) or parameter.idl
+    yield from _limit_problems(parameter, numeric=scalar not in ("string", "boolean"))
+    yield from tuple_problems(parameter, ("choices", "aliases", "former"), str, "strings")
+    yield from field_problems(parameter, {"choices": each(bad_optional_text), "aliases": each(bad_name)})
+    choices, fallback = parameter.choices, parameter.fallback
+    if choices and scalar != "string":
+        yield f"choices: expected none for the type {parameter.idl}; only strings can have choices"
+    if word := duplicate(choices):
+        yield f"choices: {short_repr(word)} occurs twice"
+    if choices and fallback and fallback not in choices:
+        yield f"fallback: expected one of the choices, got {short_repr(fallback)}"
+
+
+def _limit_problems(parameter: Parameter, numeric: bool) -> Iterator[str]:
+    low, high = parameter.minimum, parameter.maximum
+    for name, limit in (("minimum", low), ("maximum", high)):
+        if limit is not None and not (numeric and is_number(limit)):
+            yield f"{name}: expected {'a finite number or ' if numeric else ''}None, got {short_repr(limit)}"
+    if low is not None and high is not None and low > high:
+        yield f"minimum: {low} is above the maximum, {high}"
+    if parameter.least > parameter.most:
+        yield f"least: {parameter.least} is above most, {parameter.most}"

@@ -1,10 +1,14 @@
-"""Bibliographic references, and the citations by which declarations refer to them."""
+"""Bibliographic references, and the citations by which declarations refer to them.
+
+`literature.bib` contains the publications that the built-in representations and their validation cite.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rosafe.declarations.checks import bad_name, bad_optional_text, bad_text, field_problems
@@ -147,6 +151,9 @@ def from_bibtex(text: str) -> Iterator[Reference]:
         )
 
 
+LITERATURE = {one.key: one for one in from_bibtex(Path(__file__).with_name("literature.bib").read_text("utf-8"))}
+
+
 @dataclass(frozen=True)
 class Citation:
     """A reference of a representation.
@@ -175,6 +182,11 @@ class Citation:
     def applies(self, parameters: Mapping[str, Any]) -> bool:
         """Return whether it applies with these parameters; parameters that are missing do not exclude it."""
         return all(_matches(parameters.get(name, value), value) for name, value in self.when)
+
+
+def cite(key: str, subject: str = "", when: tuple[tuple[str, Any], ...] = ()) -> Citation:
+    """Return a citation of an entry of `literature.bib`."""
+    return Citation(LITERATURE[key], subject, when)
 
 
 def _matches(value: Any, expected: Any) -> bool:

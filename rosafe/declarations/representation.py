@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from rosafe.declarations.checks import (
     bad_flag,
@@ -54,6 +55,7 @@ RESERVED_PARTS = frozenset(
         "frameRate",
     ]
 )
+Advice = Callable[[Mapping[str, Any]], str] | None  # a warning, or '', about the values of parameters
 
 
 @dataclass(frozen=True)
@@ -111,11 +113,11 @@ _TEXTS = ("doc", "name_doc", "port_doc")
 _ALIASES = ("request_aliases", "port_aliases", "word_aliases")
 _TYPES = {
     "kind": bad_name,
-    **dict.fromkeys((*_NAMES, *_TEXTS, "parent", "unit", "centred"), bad_string),
+    **dict.fromkeys((*_NAMES, *_TEXTS, "parent", "unit", "centred", "background", "channel_parameter"), bad_string),
     "allow_nan": bad_flag,
 }
 _TUPLES: tuple[tuple[type, str, tuple[str, ...]], ...] = (
-    (str, "strings", ("axes", "request_order", "coordinates", "features", *_ALIASES)),
+    (str, "strings", ("axes", "request_order", "coordinates", "features", "amplitude_choice", *_ALIASES)),
     (Part, "Part", ("parts",)),
     (Parameter, "Parameter", ("parameters",)),
     (Derived, "Derived", ("derived",)),
@@ -125,7 +127,9 @@ _VALUES = {
     **dict.fromkeys(_NAMES, bad_name),
     **dict.fromkeys(_ALIASES, each(bad_name)),
     **dict.fromkeys(_TEXTS, bad_text),
-    "parent": bad_optional_name,
+    **dict.fromkeys(("parent", "background"), bad_optional_name),
+    "level": lambda value: "" if value in (0, 10, 20) else f"expected 0, 10 or 20 dB, got {short_repr(value)}",
+    "advice": lambda value: "" if value is None or callable(value) else f"expected a function, got {short_repr(value)}",
     "unit": bad_optional_text,
     "features": each(bad_text),
 }
@@ -160,6 +164,18 @@ class Representation:
         The names of the rows along its `feature` axis, if they never change.
     centred : str
         The axis that is aligned at its middle if an update changes its length; other axes are aligned at the start.
+    level : float
+        dB per factor of ten if plots show the values as levels: 10 for powers, 20 for amplitudes; 0 otherwise.
+    amplitude_choice : tuple of (str, str)
+        The parameter and the choice of it with which the values are amplitudes instead of powers; empty for none.
+    background : str
+        The kind over which plots draw this one, if a result has both: values that are not 0 as marks, the first
+        feature (Hz) as points.
+    channel_parameter : str
+        The parameter that sets the centre frequencies of the channels, if this kind creates the axis `channel`.
+    advice : callable
+        Returns a warning about valid but unsuitable values, or ''. It gets a dict with the parameters of the kind and
+        of the kinds that it is computed from.
     allow_nan : bool
         Whether the output of a plugin may contain NaN or infinity; otherwise such output ends the processor.
     references : tuple of Citation
@@ -178,6 +194,11 @@ class Representation:
     coordinates: tuple[str, ...] = ()
     features: tuple[str, ...] = ()
     centred: str = ""
+    level: float = 0.0
+    amplitude_choice: tuple[str, ...] = ()
+    background: str = ""
+    channel_parameter: str = ""
+    advice: Advice = None
     allow_nan: bool = False
     name: str = ""
     name_doc: str = ""
@@ -226,6 +247,7 @@ class Representation:
         if self.features and "feature" not in axes:
             yield "features: expected none without an axis feature"
         yield from self._parameter_problems()
+        yield from self._rule_problems()
         for field in ("features", "coordinates"):
             if name := duplicate(getattr(self, field)):
                 yield f"{field}: {name!r} occurs twice"
@@ -241,7 +263,15 @@ class Representation:
                 yield f"parameters: {name!r} is the name of another field of the request"
         if self.request_order and sorted(self.request_order) != sorted(p.name for p in self.parameters):
             yield "request_order: expected the names of all parameters, each once"
+
+    def _rule_problems(self) -> Iterator[str]:
         types = {p.name: p.idl for p in self.parameters} | {d.name: d.idl for d in self.derived}
+        choices = {(p.name, choice) for p in self.parameters for choice in p.choices}
+        if self.amplitude_choice and self.amplitude_choice not in choices:
+            yield f"amplitude_choice: expected a parameter and one of its choices, got {self.amplitude_choice!r}"
+        of_channels = self.channel_parameter
+        if of_channels and (types.get(of_channels) != "sequence<double>" or "channel" not in self.parts[0].axes):
+            yield f"channel_parameter: expected a sequence<double>, and the axis channel, got {of_channels!r}"
         for name in self.coordinates:
             if not element(types.get(name, "")):
                 yield f"coordinates: expected a parameter or derived value that is a sequence, got {name!r}"
@@ -274,6 +304,11 @@ class Representation:
         """The parts by their names in a result: the kind, followed by the name of the part if there are several."""
         several = len(self.parts) > 1
         return {f"{self.kind}_{part.name}" if several else self.kind: part for part in self.parts}
+
+    def decibels(self, values: Mapping[str, Any]) -> float:
+        """Return the dB per factor of ten with which plots show it as a level; 0 if they show the values themselves."""
+        name, choice = self.amplitude_choice or ("", "")
+        return 20.0 if name and values.get(name) == choice else float(self.level)
 
     @property
     def task(self) -> str:

@@ -8,6 +8,9 @@ processing and perception", J. Acoust. Soc. Am. 124. Designs as in the MATLAB fu
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import scipy
 
@@ -23,84 +26,15 @@ PEAK_DB = {"jepsen": 55.9986, "lopezpoveda": 66.2888}
 REFERENCE_DB_SPL = 104.0  # level at which the displacement was measured
 REFERENCE_PRESSURE = 20e-6  # Pa
 
+_TABLES = json.loads(Path(__file__).with_name("middle_ear.json").read_text("utf-8"))
 # Goode et al. (1994): Hz, peak-to-peak displacement of the stapes in µm at 104 dB SPL
-STAPES_DISPLACEMENT = np.array(
-    [
-        (400, 0.19953),
-        (600, 0.22909),
-        (800, 0.21878),
-        (1000, 0.15136),
-        (1200, 0.1),
-        (1400, 0.07943),
-        (1600, 0.05754),
-        (1800, 0.04365),
-        (2000, 0.03311),
-        (2200, 0.02754),
-        (2400, 0.02188),
-        (2600, 0.0182),
-        (2800, 0.01445),
-        (3000, 0.01259),
-        (3500, 0.009),
-        (4000, 0.007),
-        (4500, 0.00457),
-        (5000, 0.005),
-        (5500, 0.004),
-        (6000, 0.003),
-        (6500, 0.00275),
-    ]
-)
+STAPES_DISPLACEMENT = np.array(_TABLES["stapes_displacement"])
 
 # Lopez-Poveda and Meddis (2001): Hz, peak velocity of the stapes in m/s at 0 dB SPL, extrapolated at both ends
-STAPES_VELOCITY_EXTRAPOLATED = np.array(
-    [
-        (100, 1.181e-09),
-        (200, 2.363e-09),
-        (7000, 8.705e-10),
-        (7500, 8e-10),
-        (8000, 7.577e-10),
-        (8500, 7.168e-10),
-        (9000, 6.781e-10),
-        (9500, 6.24e-10),
-        (10000, 6e-10),
-    ]
-)
+STAPES_VELOCITY_EXTRAPOLATED = np.array(_TABLES["stapes_velocity_extrapolated"])
 
 # Jepsen et al. (2008): Hz, impedance of the stapes
-STAPES_IMPEDANCE = np.array(
-    [
-        (50, 48046.39731),
-        (100, 24023.19865),
-        (200, 12011.59933),
-        (400, 6005.799663),
-        (600, 3720.406871),
-        (800, 2866.404385),
-        (1000, 3363.247811),
-        (1200, 4379.228921),
-        (1400, 4804.639731),
-        (1600, 5732.808769),
-        (1800, 6228.236688),
-        (2000, 7206.959596),
-        (2200, 9172.494031),
-        (2400, 9554.681282),
-        (2600, 10779.64042),
-        (2800, 12011.59933),
-        (3000, 14013.53255),
-        (3500, 16015.46577),
-        (4000, 18017.39899),
-        (4500, 23852.82136),
-        (5000, 21020.29882),
-        (5500, 22931.23508),
-        (6000, 28027.06509),
-        (6500, 28745.70779),
-        (7000, 32098.9),
-        (7500, 34504.4),
-        (8000, 36909.9),
-        (8500, 39315.4),
-        (9000, 41720.9),
-        (9500, 44126.4),
-        (10000, 46531.9),
-    ]
-)
+STAPES_IMPEDANCE = np.array(_TABLES["stapes_impedance"])
 
 
 def middle_ear_fir(model: str, sample_rate: float, unity: bool) -> FloatArray:

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, ClassVar
 
+from rosafe.declarations.representation import Advice, Representation
+
 from .signal_format import SignalFormat
 from .stage import Stage
 
@@ -61,7 +63,7 @@ def variant(base: type[Stage], kind: str, prefix: str, doc: str = "", **defaults
         parameters=tuple(replace(p, name=names[p.name], aliases=(), former=()) for p in inner),
         request_order=tuple(names[name] for name in known.request_order),
         derived=tuple(replace(d, name=names[d.name]) for d in known.derived),
-        coordinates=tuple(names[name] for name in known.coordinates),
+        **_outward_rules(known, names),
         **renewed,
     )
     attributes: dict[str, Any] = {
@@ -71,6 +73,33 @@ def variant(base: type[Stage], kind: str, prefix: str, doc: str = "", **defaults
     }
     attributes |= {"__doc__": base.__doc__, "__module__": sys._getframe(1).f_globals["__name__"]}
     return type(kind[:1].upper() + kind[1:], (_Variant, base), attributes)
+
+
+def _outward_rules(known: Representation, names: Mapping[str, str]) -> dict[str, Any]:
+    """Return the fields of the base that contain names of parameters, with the names of the variant."""
+    return {
+        "coordinates": tuple(names[name] for name in known.coordinates),
+        "amplitude_choice": tuple(names.get(word, word) for word in known.amplitude_choice),
+        "channel_parameter": names.get(known.channel_parameter, ""),
+        "advice": _outward_advice(known.advice, names),
+    }
+
+
+def _outward_advice(advice: Advice, names: Mapping[str, str]) -> Advice:
+    """Return the `advice` of the base for values by the names of the variant."""
+    if advice is None:
+        return None
+
+    def outward(values: Mapping[str, Any]) -> str:
+        inward = {name: values[new] for name, new in names.items() if new in values}
+        return _renamed(advice({**values, **inward}), names)
+
+    return outward
+
+
+def _renamed(text: str, names: Mapping[str, str]) -> str:
+    """Replace the names of the base in a message by those of the variant."""
+    return re.sub("|".join(rf"\b{name}\b" for name in names), lambda found: names[found[0]], text)
 
 
 class _Variant(Stage):
@@ -107,8 +136,7 @@ class _Variant(Stage):
         try:
             yield
         except ValueError as problem:
-            text = re.sub("|".join(rf"\b{name}\b" for name in cls.NAMES), lambda m: cls.NAMES[m[0]], str(problem))
-            raise ValueError(text).with_traceback(problem.__traceback__) from None
+            raise ValueError(_renamed(str(problem), cls.NAMES)).with_traceback(problem.__traceback__) from None
 
     def reconfigure(self, given: SignalFormat, changes: Collection[Mapping[str, Any]]) -> None:
         inward = [self._inward(change) for change in changes]

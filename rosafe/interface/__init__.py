@@ -40,39 +40,3 @@ def all_services() -> Iterator[tuple[ComponentSpec, Service]]:
     for component in COMPONENTS.values():
         for service in component.on_graph:
             yield component, service
-
-
-__all__ = [
-    "BASS",
-    "BLOCK_AND_BUFFERS",
-    "COMMON_SERVICES",
-    "COMPONENTS",
-    "CORE_REPRESENTATIONS",
-    "FIND",
-    "GENOM_EXCEPTIONS",
-    "GENOM_STATE_PORT",
-    "KINDS",
-    "LAYOUTS",
-    "LOAD_SETUP",
-    "MAX_ACTIVITIES",
-    "MAX_SECONDS",
-    "MAX_SEQUENCE",
-    "MAX_SETUP",
-    "MAX_STRING",
-    "PLUGINS",
-    "PROBLEMS",
-    "REQUEST",
-    "REQUIRED",
-    "RESTORED_PARAM",
-    "ROSAFE",
-    "SAVE_SETUP",
-    "ComponentError",
-    "ComponentSpec",
-    "Parameter",
-    "PortSpec",
-    "Representation",
-    "Service",
-    "all_services",
-    "format_value",
-    "ros_type",
-]

@@ -6,9 +6,10 @@ import argparse
 import sys
 from pathlib import Path
 
+import rosafe
 from rosafe.representations.registry import builtin_stages
 
-from . import BASS, citation_file, citing, files, reference
+from . import BASS, citation_file, citing, files, functions, reference
 from .rosafe import derive
 
 ROOT = Path(__file__).parents[2]
@@ -19,7 +20,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python3 -m rosafe.interface",
         description="Write the .msg, .srv and .action files, their lists in CMakeLists.txt, docs/parameters.md, "
-        "docs/citing.md and CITATION.cff.",
+        "docs/citing.md, CITATION.cff and rosafe/__init__.pyi.",
         epilog="example: python3 -m rosafe.interface --check",
     )
     parser.add_argument("--check", action="store_true", help="write nothing, only list the files that are out of date")
@@ -30,6 +31,7 @@ def main(argv: list[str] | None = None) -> int:
     expected[ROOT / "docs" / "parameters.md"] = reference.markdown(components, kinds)
     expected[ROOT / "docs" / "citing.md"] = citing.markdown(kinds)
     expected[ROOT / "CITATION.cff"] = citation_file.text(citing.references(kinds.values(), {}))
+    expected[ROOT / "rosafe" / "__init__.pyi"] = functions.stub(kinds, rosafe._MODULES, rosafe.__all__)
     stale = files.stale(expected)
     for path in stale:
         print(path.relative_to(ROOT))

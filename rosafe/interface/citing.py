@@ -4,49 +4,18 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from rosafe.declarations.literature import TWOEARS_2018
 from rosafe.declarations.parameter import format_value
-from rosafe.declarations.reference import Citation, Reference, applicable
+from rosafe.declarations.reference import LITERATURE, Citation, Reference, applicable
 from rosafe.declarations.representation import Representation
 from rosafe.system.version import AUTHORS, VERSION
 
+FRONT_END = LITERATURE["twoears2018"]
 _WIDTH = 100  # characters of a line
 
 TITLE = "rosAFE in Python: the Two!Ears auditory front-end"
-HEAD = """# Citing rosAFE
-
-If results of rosAFE are part of a publication, please cite the software, the Two!Ears auditory front-end whose models
-it computes, and the publications of the representations in use. `rosafe cite` prints a paragraph for a methods section
-with a list of references. With a result of `rosafe process` it contains the version, the sample rate, the parameters
-and the publications that apply to them:
-
-```sh
-rosafe cite speech.npz
-rosafe cite speech.npz --bibtex > references.bib
-rosafe cite --outputs ratemap,ild --set ihc_method=breebart    # without a result
-```
-
-In Python, `result.save("speech.npz")` writes a file for `rosafe cite`. This page and `CITATION.cff` are generated from
-the declarations of the representations by `python3 -m rosafe.interface`.
-
-## The software
-
-{software}
-
-## Publications of the representations
-
-| representation | publication | subject | applies if |
-|---|---|---|---|
-{rows}
-
-## BibTeX
-
-```bibtex
-{bibtex}
-```
-"""
 
 
 def software(version: str = VERSION) -> Reference:
@@ -64,7 +33,7 @@ def software(version: str = VERSION) -> Reference:
 def references(kinds: Iterable[Representation], parameters: Mapping[str, Any]) -> list[Reference]:
     """Return the publications of some representations with these parameters, each once, in the order of the names."""
     found = {c.reference.key: c.reference for kind in kinds for c in applicable(kind.references, parameters)}
-    found[TWOEARS_2018.key] = TWOEARS_2018
+    found[FRONT_END.key] = FRONT_END
     return sorted(found.values(), key=lambda one: (one.names[0].lower(), one.year, one.key))
 
 
@@ -95,7 +64,7 @@ def paragraph(
     at = f" at a sample rate of {sample_rate:g} Hz" if sample_rate else ""
     text = (
         f"Auditory representations were computed{at} with rosAFE, version {version} ({software().bracketed}), a "
-        f"Python implementation of the Two!Ears auditory front-end ({TWOEARS_2018.bracketed})."
+        f"Python implementation of the Two!Ears auditory front-end ({FRONT_END.bracketed})."
     )
     steps = list(filter(None, (_step(kind, parameters) for kind in kinds if kind.parent)))
     if steps:
@@ -140,8 +109,9 @@ def bibtex(entries: Iterable[Reference]) -> str:
 def markdown(kinds: Mapping[str, Representation]) -> str:
     """Return docs/citing.md."""
     entries = [software(), *references(kinds.values(), {})]
-    return HEAD.format(
-        software="\n".join(f"* {entry.text}" for entry in (software(), TWOEARS_2018)),
+    template = Path(__file__).with_name("citing_template.md").read_text("utf-8")
+    return template.format(
+        software="\n".join(f"* {entry.text}" for entry in (software(), FRONT_END)),
         rows="\n".join(row for kind in kinds.values() for row in _rows(kind)),
         bibtex=bibtex(entries).rstrip(),
     )

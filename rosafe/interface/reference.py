@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rosafe.declarations.idl import ros_type
@@ -11,24 +12,6 @@ from rosafe.declarations.representation import Representation
 
 from .remarks import PRESETS
 from .service import ComponentSpec, PortSpec, Service
-
-HEAD = """# Requests, parameters and ports
-
-This reference of all requests is generated from the interface table by `python3 -m rosafe.interface`.
-
-* Each request is a ROS service `/<component>/<Request>`. An *activity* is also an action of the same name, which
-  returns its result when the activity ends.
-* ROS requests carry no defaults: an empty string, an empty list and a zero in a numeric field stand for the default.
-  Exception: 0 is a value of bass's sampleRate. `modifyParameter`, `rosafe.process`, `rosafe request` and the clients of
-  genomixd (Tcl, MATLAB, HTTP) pass every value literally, because they fill in the defaults themselves.
-* Each response begins with `bool genom_success` and `string genom_exdetail`, such as
-  `{"ex":"::rosAFE::e_noData","what":"the Audio port is not connected: call connect_port first"}`. `what` is the reason
-  as text; it is a member of `detail` if the exception has a member of that name.
-* If a string parameter has choices, the node replaces an unknown word by the default, as in the original, with a
-  warning in its log, in `/diagnostics` and to clients of genomixd. `rosAFE-ros --strict`, or the ROS parameter
-  `/rosAFE/strict_words` (at any time), makes the node reject unknown words with `e_badNewValue`. Kinds that the
-  original does not have, `rosafe request` and `rosafe.process` always reject them.
-"""
 
 PRESETS_HEAD = """## Presets
 
@@ -68,7 +51,7 @@ those of the defaults.
 
 def markdown(components: Iterable[ComponentSpec], kinds: Mapping[str, Representation]) -> str:
     """Return the complete document."""
-    lines = [HEAD]
+    lines = [Path(__file__).with_name("parameters_head.md").read_text("utf-8")]
     for component in components:
         lines += _component(component, kinds)
     return "\n".join([*lines, *_presets()])

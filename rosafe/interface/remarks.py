@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
+from rosafe.declarations.text import short_repr
 from rosafe.interface import KINDS
-from rosafe.interface.arguments import is_parameter
+from rosafe.interface.arguments import is_parameter, needed
 
 # Parameters for a purpose, by name. docs/parameters.md describes how they were measured.
 PRESETS: dict[str, dict[str, Any]] = {
@@ -21,30 +22,21 @@ PRESETS: dict[str, dict[str, Any]] = {
     "onsets": {"trm_minStrengthdB": 8.0, "trm_minSpread": 6, "trm_minValuedB": -80.0},
 }
 MIN_PLAUSIBLE_RATE = 400.0  # Hz; below it, errors suggest that the sample rate is given in kHz
-MIN_PERIODS = 3.0  # of the lowest pitch in the window of the autocorrelation
 
 
 def warnings_of(values: Mapping[str, Any], outputs: Collection[str]) -> list[str]:
     """Return warnings, each one line, about parameters for these outputs; the defaults complete `values`."""
-    if "pitch" not in outputs:
-        return []
-    text = short_window(
-        values.get("pi_rangeHz", KINDS["pitch"].parameter("pi_rangeHz").default),
-        values.get("ac_wSizeSec", KINDS["autocorrelation"].parameter("ac_wSizeSec").default),
-    )
-    return [text] if text else []
+    kinds = needed(outputs)
+    defaults = {p.name: p.default for kind in kinds for p in KINDS[kind].parameters}
+    return list(filter(None, (advice(kind, {**defaults, **values}) for kind in kinds)))
 
 
-def short_window(range_hz: Collection[float], seconds: float) -> str:
-    """Return a warning if the window of the autocorrelation is too short for the pitch range; otherwise ''."""
-    lowest = min(range_hz)
-    if lowest * seconds >= MIN_PERIODS - 1e-9:
-        return ""
-    return (
-        f"pi_rangeHz, ac_wSizeSec: a window of {seconds:g} s contains fewer than {MIN_PERIODS:g} periods of "
-        f"{lowest:g} Hz, the lowest pitch of the range; pitches below {MIN_PERIODS / seconds:.0f} Hz are unreliable "
-        'and may be reported as higher ones; for voices use rosafe.PRESETS["speech"] (--preset speech)'
-    )
+def advice(kind: str, values: Mapping[str, Any]) -> str:
+    """Return the warning that a kind declares about its parameters and those of its ancestors; empty for none."""
+    try:
+        return " ".join(str(declared(values)).split()) if (declared := KINDS[kind].advice) else ""
+    except Exception as problem:  # of a plugin
+        return f"{kind}: advice: {type(problem).__name__}: {short_repr(str(problem))}"
 
 
 def no_frames(kinds: Collection[str], empty: bool, option: str) -> str:

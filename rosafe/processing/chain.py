@@ -26,9 +26,6 @@ from rosafe.tree.tree import Tree
 MAX_FRAMES = DEFAULT_FRAMES_PER_BLOCK
 MAX_BYTES = 2**22
 
-FILTERBANK = "gammatone"  # the first kind that has channels
-SHARED_KINDS = ("input", "preProc")  # computed once, even if the tree has several branches
-
 
 class _GatedSource:
     """Feeds blocks to the tree after `start` has been called, which follows the creation of the whole tree.
@@ -178,7 +175,7 @@ class Chain:
         divided = (
             branches > 1
             and kernels.compiled()
-            and all(STAGES[kind].CHANNEL_INDEPENDENT for kind in kinds if kind not in SHARED_KINDS)
+            and all(STAGES[kind].CHANNEL_INDEPENDENT for kind in kinds if kind not in _above_channels(kinds))
         )
         in_place = in_place_kinds(kinds, self._outputs)
         for kind in kinds:  # parents come first
@@ -187,11 +184,12 @@ class Chain:
             added = self._processors[kind] = []
             if not parent:
                 added.append(self._tree.add_input(kind, self._source, 0, 0.0, 0.0, own, self._ears))
-            elif kind == FILTERBANK and divided:
+            elif KINDS[kind].channel_parameter and divided:
                 (above,) = self._processors[parent]
+                name = KINDS[kind].channel_parameter
                 frequencies = STAGES[kind](above.signal, **own).output_format.center_frequencies
                 for share in _shares(frequencies, branches):
-                    added.append(self._tree.add(kind, f"{kind} {len(added)}", parent, {**own, "fb_cfHz": share}))
+                    added.append(self._tree.add(kind, f"{kind} {len(added)}", parent, {**own, name: share}))
             else:
                 for above in self._processors[parent]:
                     added.append(self._tree.add(kind, above.name.replace(parent, kind), above.name, own))
@@ -322,12 +320,17 @@ class Chain:
                 values = (
                     parameters[name] if name in parameters else max((d[name] for d in self._derived.values()), key=len)
                 )
-                if kind == FILTERBANK:  # its channels are spread over the branches
+                if name == processor.representation.channel_parameter:  # its channels are spread over the branches
                     values = list(itertools.chain(values, *(other.stage.parameters[name] for other in others)))
                 described[name] = axis_values(values)
             if processor.signal.framed and kind in self._outputs:
                 described[f"{kind}_frameRate"] = processor.rate
         return described
+
+
+def _above_channels(kinds: Iterable[str]) -> list[str]:
+    """Return the kinds that are computed once, even if the channels are computed in several branches."""
+    return needed(KINDS[kind].parent for kind in kinds if KINDS[kind].channel_parameter)
 
 
 def axis_values(values: Sequence[Any]) -> list[str] | np.ndarray:

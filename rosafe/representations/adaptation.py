@@ -8,17 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rosafe.declarations.literature import (
-    BREEBAART_2001,
-    DAU_1996,
-    DAU_1997,
-    JEPSEN_2008,
-    PUSCHEL_1988,
-    TERHARDT_1979,
-    VANDORP_2013,
-)
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.numeric_limits import LIMIT, FloatArray
@@ -101,17 +92,17 @@ class Adaptation(Stage):
         ),
         port_doc="Output of the adaptation loops (model units)",
         references=(
-            Citation(PUSCHEL_1988, "feedback loops", (("adpt_model", ("", "adt_dau", "adt_puschel")),)),
-            Citation(DAU_1996, "feedback loops"),
-            Citation(
-                DAU_1997,
+            cite("puschel1988", "feedback loops", (("adpt_model", ("", "adt_dau", "adt_puschel")),)),
+            cite("dau1996", "feedback loops"),
+            cite(
+                "dau1997",
                 "limit of the overshoot",
                 (("adpt_model", ("", "adt_dau", "adt_breebaart", "adt_vandorpschuitman")),),
             ),
-            Citation(BREEBAART_2001, "time constants", (("adpt_model", "adt_breebaart"),)),
-            Citation(VANDORP_2013, "threshold of each channel", (("adpt_model", "adt_vandorpschuitman"),)),
-            Citation(TERHARDT_1979, "threshold of hearing", (("adpt_model", "adt_vandorpschuitman"),)),
-            Citation(JEPSEN_2008, "squared input after DRNL filters", (("fb_type", "drnl"),)),
+            cite("breebaart2001", "time constants", (("adpt_model", "adt_breebaart"),)),
+            cite("vandorp2013", "threshold of each channel", (("adpt_model", "adt_vandorpschuitman"),)),
+            cite("terhardt1979", "threshold of hearing", (("adpt_model", "adt_vandorpschuitman"),)),
+            cite("jepsen2008", "squared input after DRNL filters", (("fb_type", "drnl"),)),
         ),
     )
 

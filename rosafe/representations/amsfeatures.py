@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from rosafe.declarations.literature import EWERT_2000, KIM_2009, KOLLMEIER_1994, MAY_2014
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import MAX_FRAME_SECONDS, FrameBuffer, FramedStage, FrameGrid, batches
@@ -73,6 +72,7 @@ class AmsFeatures(FramedStage):
         doc="Amplitude modulation spectrogram",
         parent="ihc",
         axes=("ear", "channel", "filter", "time"),
+        level=20.0,
         parameters=(
             Parameter(
                 "ams_fbType",
@@ -130,10 +130,10 @@ class AmsFeatures(FramedStage):
         request="ModulationProc",
         port_doc="Amplitude modulation spectrograms, [filter][channel][frame]",
         references=(
-            Citation(MAY_2014, "amplitude modulation spectrogram"),
-            Citation(EWERT_2000, "modulation filters of constant Q", (("ams_fbType", "log"),)),
-            Citation(KIM_2009, "sums of FFT bins", (("ams_fbType", "lin"),)),
-            Citation(KOLLMEIER_1994, "sums of FFT bins", (("ams_fbType", "lin"),)),
+            cite("may2014", "amplitude modulation spectrogram"),
+            cite("ewert2000", "modulation filters of constant Q", (("ams_fbType", "log"),)),
+            cite("kim2009", "sums of FFT bins", (("ams_fbType", "lin"),)),
+            cite("kollmeier1994", "sums of FFT bins", (("ams_fbType", "lin"),)),
         ),
     )
     prefix = "ams"

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from rosafe.declarations.literature import LICKLIDER_1951, MEDDIS_1991, RABINER_1977, TOLONEN_2000
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Derived, Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer, FramedStage, batches, frame_parameters
@@ -77,10 +76,10 @@ class Autocorrelation(FramedStage):
         coordinates=("ac_lags",),
         port_doc="Autocorrelations, [lag][channel][frame]",
         references=(
-            Citation(LICKLIDER_1951, "periodicity by autocorrelation"),
-            Citation(MEDDIS_1991, "autocorrelation of each channel"),
-            Citation(RABINER_1977, "centre clipping"),
-            Citation(TOLONEN_2000, "exponent of the magnitude spectrum"),
+            cite("licklider1951", "periodicity by autocorrelation"),
+            cite("meddis1991", "autocorrelation of each channel"),
+            cite("rabiner1977", "centre clipping"),
+            cite("tolonen2000", "exponent of the magnitude spectrum"),
         ),
     )
     prefix = "ac"

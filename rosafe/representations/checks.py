@@ -79,6 +79,9 @@ def _problems(stage: Any, others: Mapping[str, type[Stage]]) -> Iterator[str]:
         yield "parent: expected a kind of processor, got none"
     if declared.parent not in others:
         yield f"parent: expected one of {', '.join(others)}, got {declared.parent!r}"
+    drawn = others[declared.background].REPRESENTATION.parts if declared.background in others else ()
+    if declared.background and [part.axes for part in drawn] != [("ear", "channel", "time")]:
+        yield f"background: expected a kind with the axes ear, channel, time, got {declared.background!r}"
     for parameter in declared.parameters:
         if parameter.idl not in TYPES:
             yield f"parameters: {parameter.name} is of type {parameter.idl}; expected one of {', '.join(TYPES)}"

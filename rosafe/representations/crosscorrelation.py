@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from rosafe.declarations.literature import MAY_2011
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Derived, Representation
 from rosafe.dsp import buffer_pool, kernels
 from rosafe.dsp.framing import FramedStage, batches, frame_parameters
@@ -56,7 +55,7 @@ class CrossCorrelation(FramedStage):
         request_aliases=("CrossCorrelation",),
         port_doc="Cross-correlations, [lag][channel][frame]",
         word="crosscorrelation",
-        references=(Citation(MAY_2011),),
+        references=(cite("may2011"),),
     )
     prefix = "cc"
     CHANNEL_INDEPENDENT = True

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.declarations.literature import GLASBERG_1990, HOHMANN_2002, JEPSEN_2008, LOPEZPOVEDA_2001, PATTERSON_1987
 from rosafe.declarations.parameter import MAX_SEQUENCE, Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.drnl import DrnlBank
 from rosafe.dsp.erb import erb_rate, erb_rate_to_frequency
@@ -48,6 +47,8 @@ class Filterbank(Stage):
         doc="Split the signal into frequency channels",
         parent="preProc",
         axes=("ear", "channel", "time"),
+        level=20.0,
+        channel_parameter="fb_cfHz",
         parameters=(
             Parameter(
                 "fb_type",
@@ -117,13 +118,11 @@ class Filterbank(Stage):
         port_doc="Output of each filterbank",
         word="filterbank",
         references=(
-            Citation(GLASBERG_1990, "spacing of the channels and bandwidth"),
-            Citation(PATTERSON_1987, "gammatone filters", (("fb_type", "gammatone"),)),
-            Citation(
-                HOHMANN_2002, "implementation as a cascade of complex one-pole filters", (("fb_type", "gammatone"),)
-            ),
-            Citation(LOPEZPOVEDA_2001, "DRNL filters", (("fb_type", "drnl"),)),
-            Citation(JEPSEN_2008, "parameters of the DRNL filters", (("fb_type", "drnl"),)),
+            cite("glasberg1990", "spacing of the channels and bandwidth"),
+            cite("patterson1987", "gammatone filters", (("fb_type", "gammatone"),)),
+            cite("hohmann2002", "implementation as a cascade of complex one-pole filters", (("fb_type", "gammatone"),)),
+            cite("lopezpoveda2001", "DRNL filters", (("fb_type", "drnl"),)),
+            cite("jepsen2008", "parameters of the DRNL filters", (("fb_type", "drnl"),)),
         ),
     )
     INPUT = ("ear", "time")

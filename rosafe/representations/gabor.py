@@ -12,9 +12,8 @@ import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from rosafe.declarations.literature import QIU_2003, SCHADLER_2012
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Derived, Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer
@@ -92,8 +91,8 @@ class Gabor(Stage):
         derived=(Derived("gb_nFeatures", "unsigned long", "Number of features"),),
         port_doc="Gabor features",
         references=(
-            Citation(SCHADLER_2012),
-            Citation(QIU_2003, "receptive fields as Gabor functions"),
+            cite("schadler2012"),
+            cite("qiu2003", "receptive fields as Gabor functions"),
         ),
     )
 

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from rosafe.declarations.literature import BERNSTEIN_1999, BREEBAART_2001, DAU_1996, JORGENSEN_2011, MAJDAK_2022
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.numeric_limits import SQUARE_TINY, TINY, FloatArray, clamp
@@ -72,18 +71,17 @@ class InnerHairCell(Stage):
         doc="Inner hair cell representation",
         parent="gammatone",
         axes=("ear", "channel", "time"),
+        level=20.0,
         parameters=(Parameter("ihc_method", "string", "dau", "The IHC method name", choices=METHODS, fallback="dau"),),
         name_doc="The name of this activity",
         port_doc="Output of each inner hair cell processor",
         word="innerhaircell",
         references=(
-            Citation(DAU_1996, "half-wave rectification and low-pass at 1 kHz", (("ihc_method", ("dau", "dau1996")),)),
-            Citation(MAJDAK_2022, "order of the low-pass", (("ihc_method", "dau1996"),)),
-            Citation(BREEBAART_2001, "half-wave rectification and low-pass of order 5", (("ihc_method", "breebart"),)),
-            Citation(
-                BERNSTEIN_1999, "compression of the envelope and low-pass at 425 Hz", (("ihc_method", "bernstein"),)
-            ),
-            Citation(JORGENSEN_2011, "envelope and low-pass at 150 Hz", (("ihc_method", "joergensen"),)),
+            cite("dau1996", "half-wave rectification and low-pass at 1 kHz", (("ihc_method", ("dau", "dau1996")),)),
+            cite("majdak2022", "order of the low-pass", (("ihc_method", "dau1996"),)),
+            cite("breebaart2001", "half-wave rectification and low-pass of order 5", (("ihc_method", "breebart"),)),
+            cite("bernstein1999", "compression of the envelope and low-pass at 425 Hz", (("ihc_method", "bernstein"),)),
+            cite("jorgensen2011", "envelope and low-pass at 150 Hz", (("ihc_method", "joergensen"),)),
         ),
     )
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rosafe.declarations.literature import MAY_2011
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FramedStage, frame_parameters
@@ -26,7 +25,7 @@ class Ild(FramedStage):
         unit="dB",
         parameters=frame_parameters("ild"),
         port_doc="Interaural level differences (dB), in `left`",
-        references=(Citation(MAY_2011),),
+        references=(cite("may2011"),),
     )
     prefix = "ild"
     CHANNEL_INDEPENDENT = True

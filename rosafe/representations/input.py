@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.declarations.literature import TWOEARS_2018
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.numeric_limits import FloatArray, clamp
 from rosafe.dsp.stage import Stage
@@ -34,7 +33,7 @@ class Input(Stage):
         name_doc="Name of the activity",
         port="inputProcPort",
         port_doc="Output of the input processor",
-        references=(Citation(TWOEARS_2018),),
+        references=(cite("twoears2018"),),
     )
     INPUT = ("ear", "time")
 

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.declarations.literature import BACKUS_2006, CLARK_2012, LIBERMAN_1988
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.stage import Stage
@@ -67,9 +66,9 @@ class Moc(Stage):
         ),
         port_doc="Attenuations (dB)",
         references=(
-            Citation(CLARK_2012, "attenuation by the rate"),
-            Citation(LIBERMAN_1988, "efferent responses"),
-            Citation(BACKUS_2006, "human reflex"),
+            cite("clark2012", "attenuation by the rate"),
+            cite("liberman1988", "efferent responses"),
+            cite("backus2006", "human reflex"),
         ),
     )
 

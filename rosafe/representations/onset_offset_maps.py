@@ -9,9 +9,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from rosafe.declarations.literature import TURGEON_2002
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer
@@ -132,10 +131,11 @@ class OnsetMap(_Map):
         kind="onsetMap",
         doc="Onset map",
         parent="onsetStrength",
+        background="onsetStrength",
         axes=("ear", "channel", "time"),
         parameters=PARAMETERS,
         port_doc="Onset maps, 0 or 1",
-        references=(Citation(TURGEON_2002),),
+        references=(cite("turgeon2002"),),
     )
 
 
@@ -146,10 +146,11 @@ class OffsetMap(_Map):
         kind="offsetMap",
         doc="Offset map",
         parent="offsetStrength",
+        background="offsetStrength",
         axes=("ear", "channel", "time"),
         parameters=PARAMETERS,
         port_doc="Offset maps, 0 or 1",
-        references=(Citation(TURGEON_2002),),
+        references=(cite("turgeon2002"),),
     )
 
 

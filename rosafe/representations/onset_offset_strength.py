@@ -6,9 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rosafe.declarations.literature import BREGMAN_1990, KLAPURI_1999
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.signal_format import SignalFormat
@@ -77,8 +76,8 @@ class OnsetStrength(_Strength):
         request="OnsetProc",
         port_doc="Onset strengths (dB)",
         references=(
-            Citation(KLAPURI_1999, "rise of the level in each channel"),
-            Citation(BREGMAN_1990, "grouping by common onset"),
+            cite("klapuri1999", "rise of the level in each channel"),
+            cite("bregman1990", "grouping by common onset"),
         ),
     )
     RISING = True
@@ -103,8 +102,8 @@ class OffsetStrength(_Strength):
         request="OffsetProc",
         port_doc="Offset strengths (dB)",
         references=(
-            Citation(KLAPURI_1999, "change of the level in each channel"),
-            Citation(BREGMAN_1990, "grouping by common offset"),
+            cite("klapuri1999", "change of the level in each channel"),
+            cite("bregman1990", "grouping by common offset"),
         ),
     )
     RISING = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -9,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rosafe.declarations.literature import MCLEOD_2005, MEDDIS_1997, SLANEY_1990
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.rounding import round_half_away
@@ -21,6 +21,19 @@ from rosafe.dsp.stage import Stage
 CONFIDENCE_SECONDS = 5.0  # time over which the greatest confidence is determined
 MAX_ORDER = 99  # of the median
 HALF_TOLERANCE = 0.03  # part of the lag, about 50 cents, for twice the shorter lag; at least one sample
+MIN_PERIODS = 3.0  # of the lowest pitch in the window of the autocorrelation
+
+
+def short_window(values: Mapping[str, Any]) -> str:
+    """Return a warning if the window of the autocorrelation is too short for the pitch range; otherwise ''."""
+    lowest, seconds = min(values["pi_rangeHz"]), values["ac_wSizeSec"]
+    if lowest * seconds >= MIN_PERIODS - 1e-9:
+        return ""
+    return (
+        f"pi_rangeHz, ac_wSizeSec: a window of {seconds:g} s contains fewer than {MIN_PERIODS:g} periods of "
+        f"{lowest:g} Hz, the lowest pitch of the range; pitches below {MIN_PERIODS / seconds:.0f} Hz are unreliable "
+        'and may be reported as higher ones; for voices use rosafe.PRESETS["speech"] (--preset speech)'
+    )
 
 
 class Pitch(Stage):
@@ -46,6 +59,8 @@ class Pitch(Stage):
         parent="autocorrelation",
         axes=("ear", "feature", "time"),
         features=("pitch", "rawPitch", "confidence"),
+        background="ratemap",
+        advice=short_window,
         allow_nan=True,
         parameters=(
             Parameter(
@@ -91,9 +106,9 @@ class Pitch(Stage):
         ),
         port_doc="pitch (Hz), rawPitch (Hz) and confidence as channels",
         references=(
-            Citation(MEDDIS_1997, "sum of the autocorrelations of all channels"),
-            Citation(SLANEY_1990, "peak of the sum"),
-            Citation(MCLEOD_2005, "peak at a shorter lag, from a part of the height of the highest"),
+            cite("meddis1997", "sum of the autocorrelations of all channels"),
+            cite("slaney1990", "peak of the sum"),
+            cite("mcleod2005", "peak at a shorter lag, from a part of the height of the highest"),
         ),
     )
     INPUT = ("ear", "channel", "lag", "time")

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from rosafe.declarations.literature import BRAASCH_2013, STERN_1988, WALLACH_1949
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Derived, Part, Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import BATCH, FrameBuffer, FramedStage, frame_parameters
@@ -113,9 +112,9 @@ class Precedence(FramedStage):
         centred="lag",
         port_doc="Interaural time differences (s), level differences (dB) and correlations of the first wave front",
         references=(
-            Citation(BRAASCH_2013),
-            Citation(STERN_1988, "weights of the channels"),
-            Citation(WALLACH_1949, "precedence effect"),
+            cite("braasch2013"),
+            cite("stern1988", "weights of the channels"),
+            cite("wallach1949", "precedence effect"),
         ),
     )
     prefix = "prec"

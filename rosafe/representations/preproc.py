@@ -7,16 +7,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from rosafe.declarations.literature import (
-    GOODE_1994,
-    JEPSEN_2008,
-    LOPEZPOVEDA_2001,
-    TCHORZ_2003,
-    TWOEARS_2018,
-    YOUNG_2006,
-)
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.middle_ear import MODELS, middle_ear_fir
 from rosafe.dsp.numeric_limits import SQUARE_TINY, FloatArray, clamp
@@ -102,28 +94,28 @@ class PreProc(Stage):
         port_doc="Output of each pre-processor",
         word="time",
         references=(
-            Citation(TWOEARS_2018, "order of the steps"),
-            Citation(YOUNG_2006, "pre-emphasis", (("pp_bPreEmphasis", True),)),
-            Citation(TCHORZ_2003, "gain control", (("pp_bNormalizeRMS", True),)),
-            Citation(JEPSEN_2008, "level convention", (("pp_bLevelScaling", True),)),
-            Citation(
-                GOODE_1994,
+            cite("twoears2018", "order of the steps"),
+            cite("young2006", "pre-emphasis", (("pp_bPreEmphasis", True),)),
+            cite("tchorz2003", "gain control", (("pp_bNormalizeRMS", True),)),
+            cite("jepsen2008", "level convention", (("pp_bLevelScaling", True),)),
+            cite(
+                "goode1994",
                 "measurements of the middle ear",
                 (
                     ("pp_bMiddleEarFiltering", True),
                     ("pp_middleEarModel", "lopezpoveda"),
                 ),
             ),
-            Citation(
-                LOPEZPOVEDA_2001,
+            cite(
+                "lopezpoveda2001",
                 "middle-ear filter",
                 (
                     ("pp_bMiddleEarFiltering", True),
                     ("pp_middleEarModel", "lopezpoveda"),
                 ),
             ),
-            Citation(
-                JEPSEN_2008,
+            cite(
+                "jepsen2008",
                 "middle-ear filter",
                 (
                     ("pp_bMiddleEarFiltering", True),

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.declarations.literature import BROWN_1994
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FramedStage, frame_parameters
@@ -29,6 +28,8 @@ class Ratemap(FramedStage):
         doc="Ratemap (cochleagram)",
         parent="ihc",
         axes=("ear", "channel", "time"),
+        level=10.0,
+        amplitude_choice=("rm_scaling", "magnitude"),
         parameters=(
             *frame_parameters("rm"),
             Parameter(
@@ -54,7 +55,7 @@ class Ratemap(FramedStage):
         request_aliases=("Ratemap",),
         port_aliases=("ratemapProcPort",),
         port_doc="Ratemaps",
-        references=(Citation(BROWN_1994),),
+        references=(cite("brown1994"),),
     )
     prefix = "rm"
     CHANNEL_INDEPENDENT = True

@@ -10,16 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.declarations.literature import (
-    JENSEN_2004,
-    LERCH_2012,
-    MISRA_2004,
-    PEETERS_2011,
-    SCHEIRER_1997,
-    TZANETAKIS_2002,
-)
 from rosafe.declarations.parameter import Parameter
-from rosafe.declarations.reference import Citation
+from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.numeric_limits import LIMIT, FloatArray
@@ -224,12 +216,12 @@ class SpectralFeatures(Stage):
         coordinates=("sf_requests",),
         port_doc="Spectral features, [feature][frame]",
         references=(
-            Citation(PEETERS_2011, "descriptors of the spectrum"),
-            Citation(MISRA_2004, "entropy"),
-            Citation(JENSEN_2004, "high-frequency content"),
-            Citation(LERCH_2012, "crest, flatness, skewness and kurtosis"),
-            Citation(TZANETAKIS_2002, "centroid, roll-off and flux"),
-            Citation(SCHEIRER_1997, "roll-off and flux of speech and music"),
+            cite("peeters2011", "descriptors of the spectrum"),
+            cite("misra2004", "entropy"),
+            cite("jensen2004", "high-frequency content"),
+            cite("lerch2012", "crest, flatness, skewness and kurtosis"),
+            cite("tzanetakis2002", "centroid, roll-off and flux"),
+            cite("scheirer1997", "roll-off and flux of speech and music"),
         ),
     )
 

@@ -7,11 +7,10 @@ from functools import partial
 import numpy as np
 import scipy.signal
 
-from rosafe.declarations.literature import BRAASCH_2013, FALLER_2004, MAY_2011, WALLACH_1949
+from rosafe.declarations.reference import LITERATURE
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.validation.comparison import (
     INDEPENDENT,
-    STAGE,
     Collection,
     Curve,
     Measured,
@@ -29,16 +28,8 @@ ROWS = Collection()
 RATE = 16000
 
 
-@ROWS.add(
-    "ild",
-    "noise with level differences from -30 to 30 dB",
-    Origin("known difference, right over left", MAY_2011),
-    "dB",
-    1e-4,  # the front-end adds 2.2e-16 to the energies
-    scaled("ild", 1 + 1e-5),
-    evidence=INDEPENDENT,
-    criterion="largest difference over all channels and frames",
-)
+# tolerance: the front-end adds 2.2e-16 to the energies
+@ROWS.listed(scaled("ild", 1 + 1e-5))
 def level_differences(process: Process) -> Measured:
     expected = np.arange(-30.0, 31, 10)
     measured = []
@@ -49,16 +40,8 @@ def level_differences(process: Process) -> Measured:
     return Measured.of(expected, expected, measured, "level difference (dB)", "ILD (dB)")
 
 
-@ROWS.add(
-    "crossCorrelation",
-    "hair cell outputs for noise, partly common to both ears",
-    Origin("`scipy.signal.correlate` of windowed frames, normalised by their energies", MAY_2011),
-    "",
-    1e-9,  # the front-end adds 2.2e-16 to the product of the energies
-    parameter("cc_wname", "hamming"),
-    evidence=STAGE,
-    criterion="largest difference, 8 channels of one frame",
-)
+# tolerance: the front-end adds 2.2e-16 to the product of the energies
+@ROWS.listed(parameter("cc_wname", "hamming"))
 def cross_correlation(process: Process) -> Measured:
     signal = np.stack((noise(3200, 1) + noise(3200, 2), np.roll(noise(3200, 1), 5) + noise(3200, 3)))
     result = process(signal, RATE, {"fb_nChannels": 8}, ["ihc", "crossCorrelation"])
@@ -75,16 +58,8 @@ def cross_correlation(process: Process) -> Measured:
     return Measured(worst, curve)
 
 
-@ROWS.add(
-    "itd",
-    "noise with delays from -0.6 to 0.6 ms, channels from 300 Hz to 1.5 kHz, median over the frames",
-    Origin("known delay, positive if the left ear is late", MAY_2011),
-    "µs",
-    2.0,  # parabola through three lags of 62.5 µs
-    shifted("itd", 3e-6, "s"),
-    evidence=INDEPENDENT,
-    criterion="largest difference of the median of each channel",
-)
+# tolerance: parabola through three lags of 62.5 µs
+@ROWS.listed(shifted("itd", 3e-6, "s"))
 def time_differences(process: Process) -> Measured:
     expected = np.linspace(-600, 600, 9)
     measured, worst, source = [], 0.0, noise(RATE)
@@ -97,16 +72,8 @@ def time_differences(process: Process) -> Measured:
     return Measured(worst, Curve(expected, expected, measured, "delay (µs)", "ITD (µs)"))
 
 
-@ROWS.add(
-    "ic",
-    "noise with interaural correlations from 0.5 to 1, long frames, no rectification",
-    Origin("known correlation of Gaussian noise", FALLER_2004),
-    "",
-    0.02,  # 4 s of noise
-    shifted("ic", -0.04),
-    evidence=INDEPENDENT,
-    criterion="largest difference of the mean over channels and frames",
-)
+# tolerance: 4 s of noise
+@ROWS.listed(shifted("ic", -0.04))
 def coherence(process: Process) -> Measured:
     expected = np.array([0.5, 0.7, 0.9, 1.0])
     measured = []
@@ -128,30 +95,13 @@ def lead_and_lag(itd: float, level_db: float) -> FloatArray:
     return np.stack((delayed(lead, itd, RATE) + echo, lead + delayed(echo, itd, RATE)))
 
 
-@ROWS.add(
-    "precedence",
-    "noise and its reflection of -3 dB from the other side after 4 ms, ITDs of 0.375 and -0.375 ms",
-    Origin("lead dominates the lateral position", WALLACH_1949),
-    "µs",
-    63.0,  # one lag
-    shifted("precedence_itd", 62.5e-6, "s"),
-    evidence=INDEPENDENT,
-    criterion=LEAD,
-)
+# tolerance: one lag
+@ROWS.listed(shifted("precedence_itd", 62.5e-6, "s"))
 def first_wave_front(process: Process) -> float:
     return _lead_error(process, -3.0)
 
 
-@ROWS.add(
-    "precedence",
-    "the same with a reflection of -20 to -6 dB",
-    Origin("localization dominance of the lead by removal of the lag", BRAASCH_2013),
-    "µs",
-    1.0,
-    shifted("precedence_itd", 62.5e-6, "s"),
-    evidence=INDEPENDENT,
-    criterion=LEAD,
-)
+@ROWS.listed(shifted("precedence_itd", 62.5e-6, "s"))
 def localization_dominance(process: Process) -> float:
     return max(_lead_error(process, level) for level in (-20.0, -10.0, -6.0))
 
@@ -166,17 +116,7 @@ def _lead_error(process: Process, level_db: float) -> float:
     return 1e6 * worst
 
 
-@ROWS.add(
-    "precedence",
-    "pairs of clicks of equal level, the second one from the other side after 2 to 7 ms; frames with clicks",
-    Origin("localization of the pair at the first click", WALLACH_1949),
-    "µs",
-    1.0,
-    shifted("precedence_itd", 62.5e-6, "s"),
-    evidence=INDEPENDENT,
-    criterion="largest difference of the median over channels from 300 to 1300 Hz and the frames with clicks, which "
-    "have more than 30 % of the highest level",
-)
+@ROWS.listed(shifted("precedence_itd", 62.5e-6, "s"))
 def click_pairs(process: Process) -> Measured:
     delays, itd, found = np.array([2.0, 3, 4, 5, 7]), 0.000375, []
     for delay in delays:
@@ -263,7 +203,9 @@ def against_model(process: Process, level: int, window: float) -> Measured:
     return Measured.of(BRAASCH_DELAYS, expected, measured, "delay of the lag (ms)", "ITD (µs)")
 
 
-MODEL = Origin("transcription of the author's program, computed with GNU Octave (docs/figures.md)", BRAASCH_2013)
+MODEL = Origin(
+    "transcription of the author's program, computed with GNU Octave (docs/figures.md)", LITERATURE["braasch2013"]
+)
 CENTROID = "largest difference of the centroid of the correlation, over delays of 1 to 8 ms"
 for _level, _window, _tolerance in ((-6, 0.02, 100.0), (-3, 0.05, 100.0)):
     ROWS.add(

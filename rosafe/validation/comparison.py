@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.declarations.reference import Reference
+from rosafe.declarations.reference import LITERATURE, Reference
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.validation.stimuli import TALKERS, largest
@@ -205,11 +206,26 @@ class Collection:
 
         return register
 
+    def listed(self, disturbance: Disturbance | None = None, **more: Any) -> Callable[[Measure], Measure]:
+        """Return a decorator that adds a comparison whose other attributes are in comparisons.json, by its name."""
+
+        def register(measure: Measure) -> Measure:
+            row = dict(_LISTED[measure.__name__])
+            source = Origin(row.pop("source", ""), LITERATURE[key] if (key := row.pop("reference", "")) else None)
+            row["requires"] = tuple(row.pop("requires", ()))
+            row.setdefault("tolerance", math.inf)
+            return self.add(source=source, disturbance=disturbance, **row, **more)(measure)
+
+        return register
+
     def limitation(
         self, kind: str, subject: str, source: Origin, unit: str, **more: Any
     ) -> Callable[[Measure], Measure]:
         """Return a decorator that adds a number without a tolerance."""
         return self.add(kind, subject, source, unit, math.inf, None, evidence=LIMITATION, **more)
+
+
+_LISTED: dict[str, dict[str, Any]] = json.loads(Path(__file__).with_name("comparisons.json").read_text("utf-8"))
 
 
 def parameter(name: str, value: Any) -> Disturbance:

@@ -7,16 +7,13 @@ from functools import lru_cache
 import numpy as np
 import scipy.signal
 
-from rosafe.declarations.literature import GARDNER_1995, KUHN_1977, WOODWORTH_1938
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization.sofa import HorizontalResponses, read_sofa
 from rosafe.validation.comparison import (
-    INDEPENDENT,
     KEMAR,
     Collection,
     Curve,
     Measured,
-    Origin,
     Process,
     scaled,
     shifted,
@@ -73,17 +70,7 @@ def rendered(azimuth: float, seconds: float = 0.5) -> FloatArray:
     return scipy.signal.fftconvolve(response(azimuth), source[np.newaxis], axes=-1)[:, : len(source)]
 
 
-@ROWS.add(
-    "ild",
-    "KEMAR, noise from 8 directions: root mean square over the channels, no rectification",
-    Origin("energies of the measured impulse responses behind gammatone filters", GARDNER_1995),
-    "dB",
-    0.15,
-    shifted("ild", 0.3, "dB"),
-    requires=(KEMAR,),
-    evidence=INDEPENDENT,
-    criterion="root mean square over directions and channels, last frame",
-)
+@ROWS.listed(shifted("ild", 0.3, "dB"))
 def head_ild(process: Process) -> Measured:
     rows = []
     for azimuth in AZIMUTHS:
@@ -96,17 +83,7 @@ def head_ild(process: Process) -> Measured:
     return Measured(error, Curve(centres, expected[-1], measured[-1], "centre frequency (Hz)", "ILD at 90° (dB)", True))
 
 
-@ROWS.add(
-    "itd",
-    "KEMAR, noise from 8 directions: channels from 200 Hz to 1.2 kHz, no rectification",
-    Origin("peaks of the cross-spectra of the measured impulse responses", GARDNER_1995),
-    "µs",
-    10.0,
-    shifted("itd", 15e-6, "s"),
-    requires=(KEMAR,),
-    evidence=INDEPENDENT,
-    criterion="largest difference of the median of each channel",
-)
+@ROWS.listed(shifted("itd", 15e-6, "s"))
 def head_itd(process: Process) -> Measured:
     rows = []
     for azimuth in AZIMUTHS:
@@ -134,32 +111,13 @@ def _sphere(process: Process, channels: tuple[float, float], formula: FloatArray
     return Measured(largest(found - expected) / largest(expected), curve)
 
 
-@ROWS.add(
-    "itd",
-    "KEMAR, channels from 200 to 500 Hz, against a rigid sphere of 8.75 cm",
-    Origin("3 a/c sin(azimuth) at low frequencies", KUHN_1977),
-    "parts of the ITD at 90°",
-    0.1,  # a head is not a sphere
-    scaled("itd", 0.75),
-    requires=(KEMAR,),
-    evidence=INDEPENDENT,
-    criterion="largest difference of the median over channels and frames",
-)
+# tolerance: a head is not a sphere
+@ROWS.listed(scaled("itd", 0.75))
 def low_frequencies(process: Process) -> Measured:
     return _sphere(process, (200.0, 500.0), 3 * np.sin(np.radians(AZIMUTHS)))
 
 
-@ROWS.add(
-    "itd",
-    "KEMAR, channels from 3 to 6 kHz, against a rigid sphere of 8.75 cm",
-    Origin("a/c (azimuth + sin(azimuth)) at high frequencies", WOODWORTH_1938),
-    "parts of the ITD at 90°",
-    0.15,
-    scaled("itd", 0.75),
-    requires=(KEMAR,),
-    evidence=INDEPENDENT,
-    criterion="largest difference of the median over channels and frames",
-)
+@ROWS.listed(scaled("itd", 0.75))
 def high_frequencies(process: Process) -> Measured:
     angles = np.radians(AZIMUTHS)
     return _sphere(process, (3000.0, 6000.0), angles + np.sin(angles))

@@ -8,27 +8,12 @@ import numpy as np
 import scipy.signal
 import scipy.stats
 
-from rosafe.declarations.literature import (
-    BROWN_1994,
-    EWERT_2000,
-    KLAPURI_1999,
-    LICKLIDER_1951,
-    MEDDIS_1997,
-    MISRA_2004,
-    PEETERS_2011,
-    RABINER_1977,
-    SCHADLER_2012,
-)
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface.remarks import PRESETS
 from rosafe.validation.comparison import (
-    DEFINITION,
-    INDEPENDENT,
-    STAGE,
     Collection,
     Curve,
     Measured,
-    Origin,
     Process,
     altered,
     parameter,
@@ -43,15 +28,7 @@ RATE = 16000
 # --- ratemap and transients --------------------------------------------------------------------------------------
 
 
-@ROWS.add(
-    "ratemap",
-    "decay of the level after the end of a sound",
-    Origin("leaky integrator with a time constant of 8 ms, closed form", BROWN_1994),
-    "dB per frame",
-    1e-6,
-    parameter("rm_decaySec", 0.0080001),
-    evidence=DEFINITION,
-)
+@ROWS.listed(parameter("rm_decaySec", 0.0080001))
 def ratemap_decay(process: Process) -> Measured:
     signal = np.concatenate((np.ones(1600), np.zeros(4000)))
     rates = process(through(signal), RATE, THROUGH, ["ratemap"])["ratemap"][0, 0]
@@ -61,47 +38,21 @@ def ratemap_decay(process: Process) -> Measured:
     return Measured(largest(np.diff(measured - expected)), Curve(times, expected, measured, "time (s)", "level (dB)"))
 
 
-@ROWS.add(
-    "ratemap",
-    "mean power of a tone in Hann windows of 20 ms after integration",
-    Origin("closed form: mean of the squared window times the squared input", BROWN_1994),
-    "(relative)",
-    1e-9,
-    parameter("rm_wname", "hamming"),
-    evidence=DEFINITION,
-    criterion="last frame of 0.5 s",
-)
+@ROWS.listed(parameter("rm_wname", "hamming"))
 def ratemap_power(process: Process) -> float:
     rates = process(through(np.full(8000, 0.3)), RATE, THROUGH, ["ratemap"])["ratemap"][0, 0]
     expected = 0.3**2 * np.mean(scipy.signal.windows.hann(320) ** 2)
     return abs(rates[-1] / expected - 1)
 
 
-@ROWS.add(
-    "onsetStrength",
-    "sum over the frames of a rise by 20 dB",
-    Origin("logarithmic difference of levels", KLAPURI_1999),
-    "dB",
-    1e-6,
-    scaled("onsetStrength", 1 + 1e-6),
-    evidence=DEFINITION,
-    criterion="frames after the start of the integrator",
-)
+@ROWS.listed(scaled("onsetStrength", 1 + 1e-6))
 def onset_sum(process: Process) -> float:
     signal = np.repeat([0.01, 0.1], 8000)
     strengths = process(through(signal), RATE, THROUGH, ["onsetStrength"])["onsetStrength"][0, 0]
     return abs(float(strengths[30:].sum()) - 20)  # after the start of the integrator
 
 
-@ROWS.add(
-    "offsetStrength",
-    "strength in each frame of silence after a sound",
-    Origin("closed form: decay of the integrator, 10.857 dB per frame", KLAPURI_1999),
-    "dB",
-    1e-6,
-    parameter("rm_decaySec", 0.0080001),
-    evidence=DEFINITION,
-)
+@ROWS.listed(parameter("rm_decaySec", 0.0080001))
 def offset_decay(process: Process) -> float:
     signal = np.concatenate((np.ones(1600), np.zeros(1600)))
     strengths = process(through(signal), RATE, THROUGH, ["offsetStrength"])["offsetStrength"][0, 0]
@@ -111,16 +62,7 @@ def offset_decay(process: Process) -> float:
 # --- periodicity -------------------------------------------------------------------------------------------------
 
 
-@ROWS.add(
-    "autocorrelation",
-    "hair cell output for a vowel-like sound, without clipping",
-    Origin("`scipy.signal.correlate` of windowed frames, divided by the number of products", LICKLIDER_1951),
-    "",
-    1e-11,
-    parameter("ac_K", 2.0000001),
-    evidence=STAGE,
-    criterion="largest difference, 6 channels of one frame",
-)
+@ROWS.listed(parameter("ac_K", 2.0000001))
 def autocorrelation(process: Process) -> Measured:
     signal = both(complex_tone(150, range(1, 20), RATE, 0.2) + 0.1 * noise(3200))
     result = process(signal, RATE, {"fb_nChannels": 6, "ac_clipAlpha": 0.0}, ["ihc", "autocorrelation"])
@@ -137,16 +79,7 @@ def autocorrelation(process: Process) -> Measured:
     return Measured(worst, curve)
 
 
-@ROWS.add(
-    "autocorrelation",
-    "centre clipping at 60 % of the extremes of a frame",
-    Origin("`scipy.signal.correlate` of the clipped frame", RABINER_1977),
-    "",
-    1e-11,
-    parameter("ac_clipAlpha", 0.7),
-    evidence=STAGE,
-    criterion="largest difference of one frame",
-)
+@ROWS.listed(parameter("ac_clipAlpha", 0.7))
 def clipping(process: Process) -> float:
     signal = noise(3200)
     output = process(through(signal), RATE, THROUGH, ["autocorrelation"])["autocorrelation"][0, 0, :, 5]
@@ -162,16 +95,8 @@ def median_pitch(process: Process, signal: FloatArray) -> float:
     return float(np.median(np.nan_to_num(pitches, nan=1.0)))
 
 
-@ROWS.add(
-    "pitch",
-    "harmonic complexes from 100 to 390 Hz",
-    Origin("known fundamental frequency", MEDDIS_1997),
-    "samples of the period",
-    0.51,  # pitch is found at whole lags
-    altered("one lag more", "pitch", lambda values: 1 / (1 / values + 1 / RATE)),
-    evidence=INDEPENDENT,
-    criterion="largest difference of the median over the frames",
-)
+# tolerance: pitch is found at whole lags
+@ROWS.listed(altered("one lag more", "pitch", lambda values: 1 / (1 / values + 1 / RATE)))
 def pitch_of_complexes(process: Process) -> Measured:
     expected = np.array([100.0, 123, 160, 199, 240, 311, 390])
     measured = []
@@ -182,16 +107,7 @@ def pitch_of_complexes(process: Process) -> Measured:
     return Measured(largest(periods), Curve(expected, expected, measured, "fundamental (Hz)", "pitch (Hz)"))
 
 
-@ROWS.add(
-    "pitch",
-    "missing fundamental: harmonics 3 to 6 of 125, 200 and 250 Hz",
-    Origin("residue pitch, known fundamental frequency", LICKLIDER_1951),
-    "samples of the period",
-    0.51,
-    altered("one lag more", "pitch", lambda values: 1 / (1 / values + 1 / RATE)),
-    evidence=INDEPENDENT,
-    criterion="largest difference of the median over the frames",
-)
+@ROWS.listed(altered("one lag more", "pitch", lambda values: 1 / (1 / values + 1 / RATE)))
 def missing_fundamental(process: Process) -> float:
     worst = 0.0
     for f0 in (125.0, 200.0, 250.0):
@@ -203,15 +119,7 @@ def missing_fundamental(process: Process) -> float:
 # --- modulation and spectral shape -------------------------------------------------------------------------------
 
 
-@ROWS.add(
-    "amsFeatures",
-    "response of the modulation filter at 64 Hz to modulations from 16 to 256 Hz",
-    Origin("band-pass with Q = 1 of one pole pair, closed form by the bilinear transform", EWERT_2000),
-    "dB",
-    0.02,
-    parameter("ams_cfHz", [4.0, 64.5]),
-    evidence=INDEPENDENT,
-)
+@ROWS.listed(parameter("ams_cfHz", [4.0, 64.5]))
 def modulation_filter(process: Process) -> Measured:
     centre, rate = 64.0, RATE / 4
     frequencies = np.array([16.0, 32, 40, 64, 104, 128, 256])
@@ -227,15 +135,8 @@ def modulation_filter(process: Process) -> Measured:
     return Measured.of(frequencies, expected, measured, "modulation frequency (Hz)", "gain (dB)", True)
 
 
-@ROWS.add(
-    "amsFeatures",
-    "strongest filter for noise that is modulated at 8, 32 and 128 Hz",
-    Origin("known modulation frequencies", EWERT_2000),
-    "octaves",
-    0.01,
-    altered("each filter exchanged for its neighbour", "amsFeatures", lambda values: np.roll(values, 1, axis=2)),
-    evidence=INDEPENDENT,
-    criterion="largest distance of the strongest filter, levels divided by the root of the bandwidth",
+@ROWS.listed(
+    altered("each filter exchanged for its neighbour", "amsFeatures", lambda values: np.roll(values, 1, axis=2))
 )
 def modulation_frequency(process: Process) -> float:
     worst, centres = 0.0, [4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0]
@@ -248,15 +149,8 @@ def modulation_frequency(process: Process) -> float:
     return worst
 
 
-@ROWS.add(
-    "spectralFeatures",
-    "centroid, spread, crest, flatness, skewness, kurtosis of the ratemap of noise",
-    Origin("numpy and scipy.stats on the same ratemap", PEETERS_2011),
-    "(relative)",
-    1e-6,  # small constants in the denominators
-    scaled("spectralFeatures", 1.00001),
-    evidence=STAGE,
-)
+# tolerance: small constants in the denominators
+@ROWS.listed(scaled("spectralFeatures", 1.00001))
 def spectral_shape(process: Process) -> float:
     words = ["centroid", "spread", "crest", "flatness", "skewness", "kurtosis"]
     result = process(both(noise(8000)), RATE, {"sf_requests": words}, ["ratemap", "spectralFeatures"])
@@ -280,15 +174,7 @@ def spectral_shape(process: Process) -> float:
     return worst
 
 
-@ROWS.add(
-    "spectralFeatures",
-    "entropy of the ratemap of noise and of a tone",
-    Origin("scipy.stats.entropy, normalised by the logarithm of the number of channels", MISRA_2004),
-    "",
-    1e-6,
-    scaled("spectralFeatures", 1.0001),
-    evidence=STAGE,
-)
+@ROWS.listed(scaled("spectralFeatures", 1.0001))
 def spectral_entropy(process: Process) -> float:
     worst = 0.0
     for signal in (noise(4000), tone(1000, RATE, 0.25)):
@@ -299,29 +185,14 @@ def spectral_entropy(process: Process) -> float:
     return worst
 
 
-@ROWS.add(
-    "gabor",
-    "number of features for 23 channels from 124 to 3657 Hz",
-    Origin("311 features", SCHADLER_2012),
-    "features",
-    0.0,
-    parameter("fb_nChannels", 24),
-    evidence=DEFINITION,
-    criterion="difference of the numbers",
-)
+@ROWS.listed(parameter("fb_nChannels", 24))
 def gabor_count(process: Process) -> float:
     parameters = {"fb_nChannels": 23, "fb_lowFreqHz": 124.0, "fb_highFreqHz": 3657.0, "rm_wSizeSec": 0.025}
     return abs(process(both(noise(16000)), RATE, parameters, ["gabor"])["gabor"].shape[1] - 311.0)
 
 
-@ROWS.add(
-    "gabor",
-    "ratio of the responses to level modulations of 12 and 5 Hz, four temporal filters",
-    Origin("cosines in a Hann envelope of 3.5 half periods, closed form", SCHADLER_2012),
-    "dB",
-    0.1,
-    altered("5 % of the previous frame added", "gabor", lambda values: values + 0.05 * np.roll(values, 1, axis=-1)),
-    evidence=DEFINITION,
+@ROWS.listed(
+    altered("5 % of the previous frame added", "gabor", lambda values: values + 0.05 * np.roll(values, 1, axis=-1))
 )
 def gabor_filters(process: Process) -> Measured:
     step, modulations = 0.01, np.array([5.0, 12.0])

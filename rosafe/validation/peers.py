@@ -7,16 +7,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from rosafe.declarations.literature import HOHMANN_2002, LICKLIDER_1951, SLANEY_1993
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface.remarks import PRESETS
 from rosafe.validation.comparison import (
-    INDEPENDENT,
-    STAGE,
     Collection,
     Curve,
     Measured,
-    Origin,
     Process,
     parameter,
     scaled,
@@ -40,17 +36,8 @@ def channels(process: Process, signal: FloatArray, centres: Iterable[float], ban
     return output[0]
 
 
-@ROWS.add(
-    "gammatone",
-    "noise, channels from 100 Hz to 8 kHz",
-    Origin("package `gammatone`, `erb_filterbank`", SLANEY_1993),
-    "(1 - r)",
-    1e-5,  # filters with four zeros
-    parameter("fb_bwERBs", 1.025),
-    requires=("gammatone",),
-    evidence=INDEPENDENT,
-    criterion="largest 1 - r of the channels",
-)
+# tolerance: filters with four zeros
+@ROWS.listed(parameter("fb_bwERBs", 1.025))
 def slaney_filters(process: Process) -> float:
     filters = importlib.import_module("gammatone.filters")
     centres, signal = np.geomspace(100, 8000, 12), noise(round(SECONDS * RATE))
@@ -58,17 +45,7 @@ def slaney_filters(process: Process) -> float:
     return decorrelation(channels(process, signal, centres, 1.019), theirs)
 
 
-@ROWS.add(
-    "gammatone",
-    "noise, channels from 100 Hz to 8 kHz, real parts",
-    Origin("pyfar, `GammatoneBands`", HOHMANN_2002),
-    "(1 - r)",
-    1e-6,
-    parameter("fb_bwERBs", 1.023),
-    requires=("pyfar",),
-    evidence=INDEPENDENT,
-    criterion="largest 1 - r of the channels",
-)
+@ROWS.listed(parameter("fb_bwERBs", 1.023))
 def hohmann_filters(process: Process) -> float:
     pyfar = importlib.import_module("pyfar")
     signal = noise(round(SECONDS * RATE))
@@ -78,17 +55,7 @@ def hohmann_filters(process: Process) -> float:
     return decorrelation(ours, real.time.reshape(ours.shape))
 
 
-@ROWS.add(
-    "pitch",
-    "glide of a harmonic complex from 110 to 220 Hz, share of the frames beyond 50 cents",
-    Origin("librosa, `pyin` with windows of 64 ms"),
-    "of the frames",
-    0.1,
-    scaled("pitch", 1.03),
-    requires=("librosa.core.pitch",),
-    evidence=INDEPENDENT,
-    criterion="share of the frames, 5 at each end left out",
-)
+@ROWS.listed(scaled("pitch", 1.03))
 def pyin(process: Process) -> Measured:
     librosa = importlib.import_module("librosa")
     rate, times = 16000, np.arange(12000) / 16000
@@ -103,17 +70,7 @@ def pyin(process: Process) -> Measured:
     return Measured(float(np.mean(np.abs(cents[inner]) > 50)), curve)
 
 
-@ROWS.add(
-    "spectralFeatures",
-    "centroid and spread of the ratemap of noise",
-    Origin("librosa, `spectral_centroid` and `spectral_bandwidth` of the same ratemap"),
-    "(relative)",
-    1e-6,
-    scaled("spectralFeatures", 1.00001),
-    requires=("librosa.feature.spectral",),
-    evidence=STAGE,
-    criterion="largest relative difference, the first three frames left out",
-)
+@ROWS.listed(scaled("spectralFeatures", 1.00001))
 def librosa_features(process: Process) -> float:
     librosa = importlib.import_module("librosa")
     words = ["centroid", "spread"]
@@ -126,17 +83,8 @@ def librosa_features(process: Process) -> float:
     return largest((result["spectralFeatures"][0] / expected - 1)[:, 3:])
 
 
-@ROWS.add(
-    "autocorrelation",
-    "hair cell output for a harmonic complex, Hamming window of 32 ms",
-    Origin("python-auditory-toolbox, `CorrelogramFrame`", LICKLIDER_1951),
-    "",
-    0.002,  # the window of the toolbox is periodic
-    parameter("ac_K", 2.02),
-    requires=("python_auditory_toolbox",),
-    evidence=STAGE,
-    criterion="largest difference, 8 channels of one frame, negative values set to 0",
-)
+# tolerance: the window of the toolbox is periodic
+@ROWS.listed(parameter("ac_K", 2.02))
 def correlogram(process: Process) -> Measured:
     auditory_toolbox = importlib.import_module("python_auditory_toolbox.auditory_toolbox")
     signal = both(complex_tone(160, range(1, 20), 16000, 0.2))
@@ -150,17 +98,7 @@ def correlogram(process: Process) -> Measured:
     return Measured(largest(np.maximum(ours, 0) - expected), curve)
 
 
-@ROWS.add(
-    "gammatone",
-    "noise, channels from 100 Hz to 20 kHz in the spacing of the toolbox",
-    Origin("python-auditory-toolbox, `ErbFilterBank`", SLANEY_1993),
-    "(1 - r)",
-    1e-5,
-    parameter("fb_bwERBs", 1.025),
-    requires=("python_auditory_toolbox",),
-    evidence=INDEPENDENT,
-    criterion="largest 1 - r of the channels",
-)
+@ROWS.listed(parameter("fb_bwERBs", 1.025))
 def toolbox_filters(process: Process) -> float:
     auditory_toolbox = importlib.import_module("python_auditory_toolbox.auditory_toolbox")
     signal = noise(round(SECONDS * RATE))

@@ -10,20 +10,7 @@ from math import pi, sqrt
 import numpy as np
 import scipy.signal
 
-from rosafe.declarations.literature import (
-    BERNSTEIN_1999,
-    BREEBAART_2001,
-    DAU_1996,
-    DAU_1997,
-    GLASBERG_1990,
-    GOODE_1994,
-    HOHMANN_2002,
-    JEPSEN_2008,
-    LOPEZPOVEDA_2001,
-    MAJDAK_2022,
-    PATTERSON_1987,
-    TWOEARS_2018,
-)
+from rosafe.declarations.reference import LITERATURE
 from rosafe.validation.comparison import (
     DEFINITION,
     INDEPENDENT,
@@ -47,15 +34,8 @@ BUTTERWORTH = "closed form of the Butterworth filter by the bilinear transform"
 # --- input and preProc -------------------------------------------------------------------------------------------
 
 
-@ROWS.add(
-    "input",
-    "samples of a 32-bit WAV file in memory",
-    Origin("decoded by libsndfile to floating point"),
-    "of full scale",
-    1e-9,  # libsndfile divides by 2**31, the original by 2**31 - 1
-    parameter("in_normalizeValue", 2**31 + 30),
-    evidence=INDEPENDENT,
-)
+# tolerance: libsndfile divides by 2**31, the original by 2**31 - 1
+@ROWS.listed(parameter("in_normalizeValue", 2**31 + 30))
 def pcm_scale(process: Process) -> float:
     import soundfile
 
@@ -68,15 +48,7 @@ def pcm_scale(process: Process) -> float:
     return largest(result["input"] - decoded.T)
 
 
-@ROWS.add(
-    "preProc",
-    "DC removal: response of order 4 from 20 Hz to 7 kHz",
-    Origin(BUTTERWORTH),
-    "dB",
-    1e-6,
-    parameter("pp_cutoffHzDC", 100.0001),
-    evidence=INDEPENDENT,
-)
+@ROWS.listed(parameter("pp_cutoffHzDC", 100.0001))
 def dc_removal(process: Process) -> Measured:
     rate, cutoff = 16000.0, 100.0
     frequencies = np.geomspace(20, 7000, 60)
@@ -87,30 +59,14 @@ def dc_removal(process: Process) -> Measured:
     return Measured.of(frequencies, expected, measured, "frequency (Hz)", "gain (dB)", True)
 
 
-@ROWS.add(
-    "preProc",
-    "level scaling: RMS of a tone of 1 Pa (94 dB SPL) for rms 1 at 100 dB SPL",
-    Origin("level convention", JEPSEN_2008),
-    "dB",
-    1e-9,
-    parameter("pp_refSPLdB", 94.00001),
-    evidence=DEFINITION,
-)
+@ROWS.listed(parameter("pp_refSPLdB", 94.00001))
 def level_scale(process: Process) -> float:
     signal = both(tone(1000, 16000, 0.1, sqrt(2)))
     output = process(signal, 16000, {"pp_bLevelScaling": True, "pp_refSPLdB": 94.0}, ["preProc"])["preProc"]
     return abs(20 * np.log10(np.sqrt(np.mean(output[0] ** 2))) - 6.0)
 
 
-@ROWS.add(
-    "preProc",
-    "pre-emphasis: response from 20 Hz to 7 kHz",
-    Origin("closed form of a first difference"),
-    "dB",
-    1e-9,
-    parameter("pp_coefPreEmphasis", 0.97000001),
-    evidence=DEFINITION,
-)
+@ROWS.listed(parameter("pp_coefPreEmphasis", 0.97000001))
 def pre_emphasis(process: Process) -> float:
     frequencies = np.geomspace(20, 7000, 60)
     output = process(both(impulse(64)), 16000, {"pp_bPreEmphasis": True}, ["preProc"])["preProc"][0]
@@ -118,16 +74,7 @@ def pre_emphasis(process: Process) -> float:
     return largest(gain_db(output, frequencies, 16000) - expected)
 
 
-@ROWS.add(
-    "preProc",
-    "gain control: RMS of a tone after ten time constants, and level difference of the ears",
-    Origin("closed form: 1 in the louder ear; the difference remains"),
-    "dB",
-    0.01,
-    altered("a gain of each ear of its own", "preProc", lambda x: x / np.std(x, axis=-1, keepdims=True)),
-    evidence=DEFINITION,
-    criterion="largest difference of the levels of both ears in the second half of 1 s",
-)
+@ROWS.listed(altered("a gain of each ear of its own", "preProc", lambda x: x / np.std(x, axis=-1, keepdims=True)))
 def gain_control(process: Process) -> float:
     signal = tone(500, 16000, 1.0, 0.03) * np.array([[1.0], [0.5]])
     parameters = {"pp_bNormalizeRMS": True, "pp_intTimeSecRMS": 0.05}
@@ -152,15 +99,8 @@ STAPES = {  # Hz: peak-to-peak displacement of the stapes in µm at 104 dB SPL
 }
 
 
-@ROWS.add(
-    "preProc",
-    "middle ear (lopezpoveda): velocity of the stapes from 400 Hz to 6 kHz",
-    Origin("measured displacements", GOODE_1994),
-    "dB",
-    0.5,  # the filter interpolates between the measured points
-    scaled("preProc", 1.1),
-    evidence=INDEPENDENT,
-)
+# tolerance: the filter interpolates between the measured points
+@ROWS.listed(scaled("preProc", 1.1))
 def middle_ear(process: Process) -> Measured:
     rate = 44100.0
     parameters = {"pp_bMiddleEarFiltering": True, "pp_middleEarModel": "lopezpoveda", "pp_bUnityComp": False}
@@ -175,15 +115,8 @@ def middle_ear(process: Process) -> Measured:
 # --- filterbanks -------------------------------------------------------------------------------------------------
 
 
-@ROWS.add(
-    "gammatone",
-    "spacing of the centre frequencies on the ERB-number scale, 80 Hz to 8 kHz",
-    Origin("equation 4", GLASBERG_1990),
-    "ERB",
-    0.005,  # 21.4 log10 of the publication is rounded: 9.294 in place of 9.265 ln
-    parameter("fb_nERBs", 1.01),
-    evidence=INDEPENDENT,
-)
+# tolerance: 21.4 log10 of the publication is rounded: 9.294 in place of 9.265 ln
+@ROWS.listed(parameter("fb_nERBs", 1.01))
 def erb_spacing(process: Process) -> Measured:
     frequencies = process(np.zeros((2, 10)), 44100, {"fb_nERBs": 1.0}, ["gammatone"])["fb_cfHz"]
     numbers = 21.4 * np.log10(4.37 * frequencies / 1000 + 1)
@@ -191,15 +124,7 @@ def erb_spacing(process: Process) -> Measured:
     return Measured.of(frequencies[1:], np.ones(len(spacing)), spacing, "centre frequency (Hz)", "spacing (ERB)", True)
 
 
-@ROWS.add(
-    "gammatone",
-    "equivalent rectangular bandwidth of the filters, 100 Hz to 8 kHz",
-    Origin("equation 3", GLASBERG_1990),
-    "(relative)",
-    0.005,
-    parameter("fb_bwERBs", 1.03),
-    evidence=INDEPENDENT,
-)
+@ROWS.listed(parameter("fb_bwERBs", 1.03))
 def bandwidths(process: Process) -> Measured:
     rate, centres = 44100.0, np.geomspace(100, 8000, 12)
     response = process(both(impulse(44100)), rate, {"fb_cfHz": list(centres)}, ["gammatone"])["gammatone"][0]
@@ -212,15 +137,7 @@ def bandwidths(process: Process) -> Measured:
     )
 
 
-@ROWS.add(
-    "gammatone",
-    "impulse responses, all-pole form, 80 Hz to 7.6 kHz",
-    Origin("closed form of a cascade of complex one-pole filters", HOHMANN_2002),
-    "of the peak",
-    1e-11,
-    parameter("fb_bwERBs", 1.018 * (1 + 1e-9)),
-    evidence=DEFINITION,
-)
+@ROWS.listed(parameter("fb_bwERBs", 1.018 * (1 + 1e-9)))
 def impulse_responses(process: Process) -> float:
     rate, count = 44100.0, 8000
     result = process(both(impulse(count)), rate, {}, ["gammatone"])
@@ -231,16 +148,7 @@ def impulse_responses(process: Process) -> float:
     return largest((result["gammatone"][0] - expected) / np.abs(expected).max(-1, keepdims=True))
 
 
-@ROWS.add(
-    "gammatone",
-    "correlation with the gammatone function of continuous time at 1 kHz",
-    Origin("definition of the gammatone", PATTERSON_1987),
-    "(1 - r)",
-    1e-6,
-    parameter("fb_bwERBs", 1.02),
-    evidence=INDEPENDENT,
-    criterion="1 - r over 34 ms, the function in the phase of the filter",
-)
+@ROWS.listed(parameter("fb_bwERBs", 1.02))
 def gammatone_function(process: Process) -> Measured:
     rate, centre = 44100.0, 1000.0
     response = process(both(impulse(1500)), rate, {"fb_cfHz": [centre]}, ["gammatone"])["gammatone"][0, 0]
@@ -326,14 +234,8 @@ def drnl_measured(process: Process, velocities: np.ndarray, frequency: float, ra
     return np.array(levels)
 
 
-@ROWS.add(
-    "gammatone",
-    "DRNL: input-output curves from 250 Hz to 8 kHz, for tones of 100 pm/s to 30 µm/s",
-    Origin("broken-stick compression of 0.25 dB/dB, parameters of Jepsen et al. (2008)", LOPEZPOVEDA_2001),
-    "dB",
-    0.01,
-    altered("output with the exponent 1.001", "gammatone", lambda values: np.sign(values) * np.abs(values) ** 1.001),
-    evidence=INDEPENDENT,
+@ROWS.listed(
+    altered("output with the exponent 1.001", "gammatone", lambda values: np.sign(values) * np.abs(values) ** 1.001)
 )
 def drnl_growth(process: Process) -> Measured:
     rate, velocities, worst = 44100.0, 10 ** np.arange(-10, -4.4, 0.5), 0.0
@@ -381,7 +283,7 @@ def other_cutoff(factor: float) -> Disturbance:
 ROWS.add(
     "ihc",
     "dau: gain of the low-pass for tones from 250 Hz to 4 kHz",
-    Origin(f"{BUTTERWORTH}, order 2 at 1 kHz (Two!Ears)", TWOEARS_2018),
+    Origin(f"{BUTTERWORTH}, order 2 at 1 kHz (Two!Ears)", LITERATURE["twoears2018"]),
     "dB",
     0.001,
     other_cutoff(1.001),
@@ -390,7 +292,7 @@ ROWS.add(
 ROWS.add(
     "ihc",
     "dau1996: gain of the low-pass for tones from 250 Hz to 4 kHz",
-    Origin(f"{BUTTERWORTH}, order 1 at 1 kHz (`ihc_dau1996` of AMT)", MAJDAK_2022),
+    Origin(f"{BUTTERWORTH}, order 1 at 1 kHz (`ihc_dau1996` of AMT)", LITERATURE["majdak2022"]),
     "dB",
     0.001,
     other_cutoff(1.001),
@@ -398,30 +300,15 @@ ROWS.add(
 )(lambda process: lowpass_row(process, "dau1996", 1))
 
 
-@ROWS.add(
-    "ihc",
-    "breebart: frequency at which the low-pass is 3 dB down",
-    Origin("fifth-order low-pass with a cutoff of 770 Hz", BREEBAART_2001),
-    "Hz",
-    3.0,  # rounded in the publication
-    other_cutoff(1.01),
-    evidence=INDEPENDENT,
-)
+# tolerance: rounded in the publication
+@ROWS.listed(other_cutoff(1.01))
 def breebaart_cutoff(process: Process) -> float:
     frequencies = np.array([740.0, 760, 770, 780, 800])
     gains = hair_cell_gain(process, "breebart", frequencies, 192000.0)
     return abs(float(np.interp(10 * np.log10(2), -gains, frequencies)) - 770.0)
 
 
-@ROWS.add(
-    "ihc",
-    "bernstein: growth of the output for 60 dB of input level",
-    Origin("envelope compressed by an exponent of 0.23, then squared: 0.46 dB/dB", BERNSTEIN_1999),
-    "dB",
-    0.01,
-    altered("output with the exponent 1.001", "ihc", lambda values: values**1.001),
-    evidence=INDEPENDENT,
-)
+@ROWS.listed(altered("output with the exponent 1.001", "ihc", lambda values: values**1.001))
 def bernstein_growth(process: Process) -> Measured:
     levels = np.arange(-60.0, 1, 10)
     parameters = {"fb_cfHz": [4000.0], "ihc_method": "bernstein"}
@@ -433,15 +320,7 @@ def bernstein_growth(process: Process) -> Measured:
     return Measured.of(levels, 2 * 0.23 * levels, measured, "input (dB)", "output (dB)")
 
 
-@ROWS.add(
-    "ihc",
-    "hilbert: depth of a 20 Hz amplitude modulation of a tone at 4 kHz",
-    Origin("closed form: three spectral lines, each with the gain of the filter at its frequency"),
-    "of the depth",
-    1e-3,
-    altered("envelope with the exponent 1.01", "ihc", lambda values: values**1.01),
-    evidence=DEFINITION,
-)
+@ROWS.listed(altered("envelope with the exponent 1.01", "ihc", lambda values: values**1.01))
 def modulation_depth(process: Process) -> float:
     rate, centre, modulation, depth = 32000.0, 4000.0, 20.0, 0.5
     carrier, slow = tone(centre, rate, 0.5), tone(modulation, rate, 0.5)
@@ -476,31 +355,14 @@ def adapted(process: Process, seconds: float, limit: float) -> np.ndarray:
     return np.array(outputs)
 
 
-@ROWS.add(
-    "adaptation",
-    "steady response to constant input from 0 to 100 dB SPL",
-    Origin("square root of the input in each of five loops", DAU_1996),
-    "MU",
-    0.01,
-    scaled("adaptation", 1.001),
-    evidence=INDEPENDENT,
-    criterion="largest difference of the response after 8 s",
-)
+@ROWS.listed(scaled("adaptation", 1.001))
 def adapted_growth(process: Process) -> Measured:
     measured = adapted(process, 8.0, 0.0)[:, 1]
     expected = model_units(10 ** ((LEVELS - 100) / 20 / 32))
     return Measured.of(LEVELS, expected, measured, "level (dB SPL)", "output (MU)")
 
 
-@ROWS.add(
-    "adaptation",
-    "overshoot without limit: first response from rest, 0 to 100 dB SPL",
-    Origin("input divided by the rest states of five loops, closed form", DAU_1996),
-    "(relative)",
-    1e-9,
-    parameter("adpt_mindB", 1e-6),
-    evidence=INDEPENDENT,
-)
+@ROWS.listed(parameter("adpt_mindB", 1e-6))
 def overshoot(process: Process) -> float:
     measured = adapted(process, 0.001, 0.0)[1:, 0]
     expected = model_units(10 ** ((LEVELS - 100) / 20) / LEAST ** (31 / 32))[1:]
@@ -515,15 +377,8 @@ def burst_response(process: Process, level: float, limit: float, times: np.ndarr
     return np.asarray(output[1600 + np.round(16 * times).astype(int)])
 
 
-@ROWS.add(
-    "adaptation",
-    "response to constant input of 500 ms at 20, 60 and 100 dB SPL, limit 10, from 0 to 499 ms after the onset",
-    Origin("transcription of `comp_adaptloop` of AMT 0.9.9, computed with GNU Octave (docs/figures.md)", MAJDAK_2022),
-    "MU",
-    1e-3,  # eight digits are kept
-    parameter("adpt_lim", 10.0001),
-    evidence=INDEPENDENT,
-)
+# tolerance: eight digits are kept
+@ROWS.listed(parameter("adpt_lim", 10.0001))
 def adapted_burst(process: Process) -> Measured:
     measured = [burst_response(process, level, 10.0, BURST_TIMES) for level in AMT_BURST]
     worst = largest(np.subtract(measured, list(AMT_BURST.values())))
@@ -533,15 +388,7 @@ def adapted_burst(process: Process) -> Measured:
     )
 
 
-@ROWS.add(
-    "adaptation",
-    "limited overshoot: first response from rest, 0 to 100 dB SPL, limit 10",
-    Origin("limiting function of each loop, closed form", DAU_1997),
-    "(relative)",
-    1e-9,
-    parameter("adpt_lim", 10.000001),
-    evidence=DEFINITION,
-)
+@ROWS.listed(parameter("adpt_lim", 10.000001))
 def limited_overshoot(process: Process) -> Measured:
     measured = adapted(process, 0.001, 10.0)[:, 0]
     values = 10 ** ((LEVELS - 100) / 20)
@@ -556,15 +403,7 @@ def limited_overshoot(process: Process) -> Measured:
     return Measured(largest((measured - expected)[1:] / expected[1:]), curve)
 
 
-@ROWS.add(
-    "moc",
-    "attenuation for ratemap levels from -200 to -80 dB",
-    Origin("cubic of the Two!Ears front-end in exact fractions, between its extremes", TWOEARS_2018),
-    "dB",
-    1e-9,
-    scaled("moc", 1 + 1e-9),
-    evidence=DEFINITION,
-)
+@ROWS.listed(scaled("moc", 1 + 1e-9))
 def efferent_attenuation(process: Process) -> Measured:
     levels, measured = [], []
     for level in range(-100, -39, 4):

@@ -11,13 +11,12 @@ import numpy as np
 import scipy.signal
 import scipy.special
 
-from rosafe.declarations.literature import DUDA_1998, GARDNER_1995, LEROUX_2019
+from rosafe.declarations.reference import LITERATURE
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization.enhancement import enhance
 from rosafe.localization.head import Head
 from rosafe.localization.localize import localize
 from rosafe.validation.comparison import (
-    INDEPENDENT,
     KEMAR,
     Collection,
     Measured,
@@ -78,17 +77,13 @@ def sphere_ratios(process: Process) -> tuple[FloatArray, FloatArray, FloatArray]
     return frequencies, right / left, (spectra[:, 1] / spectra[:, 0]).T
 
 
-SERIES = Origin("series of spherical functions for a plane wave, radius of 8.75 cm, evaluated by scipy", DUDA_1998)
+SERIES = Origin(
+    "series of spherical functions for a plane wave, radius of 8.75 cm, evaluated by scipy", LITERATURE["duda1998"]
+)
 
 
-@ROWS.add(
-    "Head.sphere",
-    "interaural level difference, 200 Hz to 8 kHz, azimuths from -90 to 90°",
-    SERIES,
-    "dB",
-    0.1,
+@ROWS.listed(
     altered("right ear louder by 0.15 dB", "responses", lambda values: values * [[1.0], [10 ** (0.15 / 20)]]),
-    evidence=INDEPENDENT,
     under_test=sphere_responses,
 )
 def sphere_levels(process: Process) -> Measured:
@@ -106,18 +101,12 @@ def sphere_levels(process: Process) -> Measured:
     return Measured(worst, levels.curve)
 
 
-@ROWS.add(
-    "Head.sphere",
-    "interaural phase delay, 200 Hz to 3 kHz, azimuths from -90 to 90°",
-    SERIES,
-    "µs",
-    5.0,
+@ROWS.listed(
     altered(
         "right ear late by a sample",
         "responses",
         lambda values: np.stack((values[:, 0], np.roll(values[:, 1], 1, -1)), 1),
     ),
-    evidence=INDEPENDENT,
     under_test=sphere_responses,
 )
 def sphere_delays(process: Process) -> Measured:
@@ -170,21 +159,10 @@ def azimuth_errors(process: Process, model: str, noisy: bool) -> FloatArray:
 
 VOICES = f"a recorded voice from each of {len(DIRECTIONS)} directions of KEMAR"
 NEEDED = (KEMAR, *TALKERS)
-MEASURED_HEAD = Origin("directions of the measured impulse responses", GARDNER_1995)
+MEASURED_HEAD = Origin("directions of the measured impulse responses", LITERATURE["gardner1995"])
 
 
-@ROWS.add(
-    "localize",
-    f"{VOICES}, model of KEMAR: azimuth",
-    MEASURED_HEAD,
-    "°",
-    5.0,
-    altered("azimuth + 6°", "azimuth", lambda values: values + 6.0),
-    evidence=INDEPENDENT,
-    criterion="95th percentile of the absolute errors of all windows with an estimate",
-    requires=NEEDED,
-    under_test=find,
-)
+@ROWS.listed(altered("azimuth + 6°", "azimuth", lambda values: values + 6.0), under_test=find)
 def matched_head(process: Process) -> float:
     return float(np.percentile(azimuth_errors(process, KEMAR, False), 95))
 
@@ -216,18 +194,7 @@ def si_sdr(estimate: FloatArray, reference: FloatArray) -> FloatArray:
     return np.asarray(10 * np.log10(np.sum(target**2, axis=-1) / np.sum((estimate - target) ** 2, axis=-1)))
 
 
-@ROWS.add(
-    "enhance",
-    "two recorded voices of equal level at 0 and 60°, and at -30 and 30° of KEMAR: change of the distortion",
-    Origin("scale-invariant signal-to-distortion ratio (SI-SDR) with respect to the voice alone", LEROUX_2019),
-    "dB",
-    -5.0,
-    late("ears", 2),
-    evidence=INDEPENDENT,
-    criterion="negative improvement of the SI-SDR, mean of both ears; the worse of the two scenes",
-    requires=NEEDED,
-    under_test=select,
-)
+@ROWS.listed(late("ears", 2), under_test=select)
 def distortion(process: Process) -> float:
     gains = []
     for wanted, other in SCENES:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.declarations.literature import TURGEON_2002
+from rosafe.declarations.reference import LITERATURE
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface.remarks import PRESETS
 from rosafe.validation.comparison import INDEPENDENT, Collection, Origin, Process, late
@@ -82,7 +82,7 @@ def _timed(output: str, subject: str, sound: Any, times: FloatArray, tolerance: 
     ROWS.add(
         output,
         f"preset `onsets`: {subject}",
-        Origin("known times; events common to neighbouring channels", TURGEON_2002),
+        Origin("known times; events common to neighbouring channels", LITERATURE["turgeon2002"]),
         "ms",
         tolerance,
         late(output, 4),
@@ -126,13 +126,7 @@ for _output in ("onsetMap", "offsetMap"):
         _rate(_output, _name, _parameters, "exact silence", lambda: np.zeros((2, SECONDS * RATE)))
 
 
-@ROWS.limitation(
-    "onsetMap",
-    "defaults: 18 bursts of noise in noise 60 dB below",
-    Origin("known times"),
-    "ms",
-    criterion=ALL,
-)
+@ROWS.listed()
 def defaults_distance(process: Process) -> float:
     return worst(marked(process, bursts(), "onsetMap", {}), TIMES)
 

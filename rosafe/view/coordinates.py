@@ -35,7 +35,7 @@ def frame_times(
 def _rate(result: Mapping[str, Any], name: str, sample_rate: float | None) -> float:
     if rate := sample_rate or result.get("sample_rate"):
         return float(rate)
-    for lags in ("cc_lags", "ac_lags", "prec_lags"):
+    for lags in (name for known in KINDS.values() for name in known.coordinates if known.units[name] == "s"):
         if np.size(result.get(lags, ())) > 1:
             return 1 / float(np.diff(result[lags][:2])[0])
     raise ValueError(f"{name}: the sample rate of the result is not known; pass it as sample_rate (Hz)")

@@ -12,15 +12,13 @@ from rosafe.interface import KINDS
 from rosafe.system.missing import require
 from rosafe.view.axes import frequency_axis, image, style
 from rosafe.view.coordinates import EARS, axis_coordinates, check_result, frame_times
-from rosafe.view.levels import LEVELS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 RANGE_DB = 60.0  # of levels, below the loudest
-BACKGROUNDS = {"pitch": "ratemap", "onsetMap": "onsetStrength", "offsetMap": "offsetStrength"}
-MAX_PITCH = 1000.0  # Hz; the upper limit of the ratemap behind the pitch
+MAX_FREQUENCY = 1000.0  # Hz; the upper limit of the background of a frequency, such as the pitch
 MAX_COLUMNS = 1500  # of an image
 WIDE_MARKS = 400  # frames up to which marks have their full width
 MAX_TICKS = 6
@@ -178,6 +176,11 @@ class _Panel:
         values = axis_coordinates(self.result, self.kind, axis, self.data.shape[self.axes.index(axis)])
         return 1e3 * values if axis == "lag" and values.dtype.kind == "f" else values
 
+    @property
+    def _decibels(self) -> float:
+        parameters = self.result.get("parameters")  # a text if numpy.load has read the file
+        return self.kind.decibels(parameters if isinstance(parameters, Mapping) else {})
+
     # --- drawing ---
 
     def draw(self, axes: Axes, ear: int) -> None:
@@ -188,8 +191,8 @@ class _Panel:
         if self.data.size == 0:
             axes.text(0.5, 0.5, "no frames", ha="center", va="center", transform=axes.transAxes)
             axes.set(xticks=[], yticks=[])
-        elif self.kind.kind == "pitch":
-            self._draw_pitch(axes, ear)
+        elif self.kind.background and self.axes == ("ear", "feature", "time"):
+            self._draw_frequency(axes, ear)
         elif self.background is not None and self.axes == ("ear", "channel", "time"):
             self._draw_marks(axes, ear)
         elif len(self.axes) == 1 + bool(self.ears):
@@ -201,10 +204,8 @@ class _Panel:
     @cached_property
     def background(self) -> _Panel | None:
         """The panel that is drawn behind this one, if the result contains it."""
-        name = BACKGROUNDS.get(self.kind.kind)
-        if name is None or not np.size(self.result.get(name, ())):
-            return None
-        return _Panel(self.result, name)
+        name = self.kind.background
+        return _Panel(self.result, name) if np.size(self.result.get(name, ())) else None
 
     def _draw_line(self, axes: Axes, ear: int) -> None:
         data = self.data[ear] if self.ears else self.data
@@ -216,22 +217,23 @@ class _Panel:
         axes.plot(times, data, linewidth=0.7, color="#1d3557")
         axes.set(xlabel="time (s)", ylabel=self.unit or "amplitude", xlim=(self.times[0], self.times[-1] + 1e-9))
 
-    def _draw_pitch(self, axes: Axes, ear: int) -> None:
-        pitch = self.data[ear, 0]
+    def _draw_frequency(self, axes: Axes, ear: int) -> None:
+        """Draw the first feature (Hz) as points over the channels of the background."""
+        values = self.data[ear, 0]
         if self.background is None:
-            axes.plot(self.times, pitch, ".", color="#e63946", markersize=4)
-            axes.set(xlabel="time (s)", ylabel="pitch (Hz)")
+            axes.plot(self.times, values, ".", color="#e63946", markersize=4)
+            axes.set(xlabel="time (s)", ylabel=f"{self.along('feature')[0]} (Hz)")
             return
         self.background._draw_image(axes, ear)
         frequencies = self.background.along("channel")
         order = np.argsort(frequencies)
-        height = np.interp(pitch, frequencies[order], order, left=np.nan, right=np.nan)
+        height = np.interp(values, frequencies[order], order, left=np.nan, right=np.nan)
         axes.plot(self.times, height, ".", color="#00e5ff", markersize=self._mark_size(4.0, 1.0))
-        top = int(np.searchsorted(frequencies, MAX_PITCH))
+        top = int(np.searchsorted(frequencies, MAX_FREQUENCY))
         if np.array_equal(order, np.arange(len(order))) and top > 1:
             frequency_axis(axes, frequencies[:top], MAX_TICKS)
             axes.set_ylim(-0.5, top - 0.5)
-        self.note = " over the ratemap"
+        self.note = f" over the {self.background.name}"
 
     def _draw_marks(self, axes: Axes, ear: int) -> None:
         assert self.background is not None
@@ -291,7 +293,7 @@ class _Panel:
         starts = np.arange(0, data.shape[-1], self._group)
         if f"{self.kind.kind}_frameRate" in self.result:
             return np.asarray(np.add.reduceat(data, starts, axis=-1) / np.diff([*starts, data.shape[-1]]))
-        return np.maximum.reduceat(np.abs(data) if self.kind.kind in LEVELS else data, starts, axis=-1)
+        return np.maximum.reduceat(np.abs(data) if self._decibels else data, starts, axis=-1)
 
     @property
     def _group(self) -> int:
@@ -302,10 +304,10 @@ class _Panel:
     def _colours(self) -> tuple[np.ndarray, str, dict[str, Any]]:
         """The values shown by colours, the label of the colour bar, and the limits, which are those of both ears."""
         data, axes, _ = self._plane
-        if self.kind.kind in LEVELS:
+        if self._decibels:
             size = np.abs(data)
             loudest = float(size.max()) or 1.0  # 1.0: silence
-            level = LEVELS[self.kind.kind] * np.log10(np.maximum(size, 1e-200) / loudest)
+            level = self._decibels * np.log10(np.maximum(size, 1e-200) / loudest)
             return np.maximum(level, -RANGE_DB), "dB re loudest", {"cmap": "magma", "vmin": -RANGE_DB, "vmax": 0.0}
         if "feature" in axes and self.along("feature").dtype.kind == "U":  # the features have different units
             whole = np.moveaxis(data, 0, -1) if self.ears else data[..., np.newaxis]

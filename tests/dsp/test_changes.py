@@ -60,40 +60,19 @@ def test_a_range_of_whole_steps_excludes_its_end(low: float, steps: int, step: f
 # --- invalid values ---------------------------------------------------------------------------------------------------
 
 NAN, INF = math.nan, math.inf
-NOT_POSITIVE: list[Any] = [0.0, -1.0, NAN, INF, "1"]
-NOT_FRACTIONS: list[Any] = [1.1, NAN, None, []]
-BAD_LISTS: list[Any] = [[100, 8000], [100, 0], [NAN], [-5], "440", ["a"], [[1], "x"], [1] * 1025]
-
-REFUSED: list[tuple[str, dict[str, Any]]] = [
-    ("input", {"in_normalizeValue": 0}),
+REFUSED: list[tuple[str, dict[str, Any]]] = [  # tests/interface tries values beyond the declared ranges
     ("input", {"in_normalizeValue": 2**64}),
-    ("input", {"in_normalizeValue": 1.5}),
-    ("input", {"in_doNormalize": 2}),
-    ("input", {"in_doNormalize": "yes"}),
     ("preProc", {"pp_bRemoveDC": True, "pp_cutoffHzDC": 8000.0}),
-    *(("preProc", {"pp_cutoffHzDC": value}) for value in NOT_POSITIVE),
-    *(("preProc", {"pp_intTimeSecRMS": value}) for value in NOT_POSITIVE),
-    *(("preProc", {"pp_coefPreEmphasis": value}) for value in NOT_FRACTIONS),
-    *(("preProc", {"pp_refSPLdB": value}) for value in (401, -1e300, NAN)),
-    *(("preProc", {"pp_middleEarModel": value}) for value in ("", "ear", 3, None)),
-    *(("gammatone", {name: value}) for name in ("fb_lowFreqHz", "fb_highFreqHz", "fb_nERBs") for value in (0, -3, NAN)),
-    *(("gammatone", {"fb_bwERBs": value}) for value in (0, NAN, INF)),
-    *(("gammatone", {"fb_nGamma": value}) for value in (0, 129, 2.5, NAN, "4")),
-    *(("gammatone", {"fb_nChannels": value}) for value in (-1, 1025, 1e300, 0.5)),
+    ("preProc", {"pp_middleEarModel": "ear"}),
     ("gammatone", {"fb_lowFreqHz": 5000.0, "fb_highFreqHz": 4000.0}),
     ("gammatone", {"fb_lowFreqHz": 4000.0, "fb_highFreqHz": 4000.0}),
     ("gammatone", {"fb_highFreqHz": 8000.0, "fb_nChannels": 16}),  # the last channel at half the sample rate
     ("gammatone", {"fb_nERBs": 1e-9}),
-    *(("gammatone", {"fb_cfHz": value}) for value in BAD_LISTS),
+    *(("gammatone", {"fb_cfHz": value}) for value in ([100, 8000], [100, 0], [NAN], "440", [[1], "x"], [1] * 1025)),
     ("gammatone", {"fb_type": "drnl", "fb_cfHz": [7900.0]}),
     ("gammatone", {"fb_type": "drnl", "fb_cfHz": [1e-300, 100]}),
-    ("gammatone", {"fb_type": "gammachirp"}),
-    ("ihc", {"ihc_method": "breebaart"}),
-    *(("ild", {name: value}) for name in ("ild_wSizeSec", "ild_hSizeSec") for value in (0, -1, NAN, 1e300, 1e-6, "x")),
-    ("ild", {"ild_wname": "hanns"}),
+    *(("ild", {name: value}) for name in ("ild_wSizeSec", "ild_hSizeSec") for value in (1e300, 1e-6)),
     ("ratemap", {"rm_scaling": "_power"}),
-    ("ratemap", {"rm_decaySec": 0}),
-    ("crossCorrelation", {"cc_maxDelaySec": 0}),
     ("crossCorrelation", {"cc_maxDelaySec": 1e300}),
 ]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Results against independent references: closed forms, published values, designs of scipy, direct sums."""
+"""Details that `rosafe validate` and the reference vectors do not reach: other orders, windows, methods and lags."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy import signal as scipy_signal
 
-from rosafe.dsp.drnl import DrnlBank
 from rosafe.dsp.erb import erb_rate, erb_rate_to_frequency
 from rosafe.dsp.middle_ear import middle_ear_fir
 from rosafe.dsp.rounding import round_half_away
@@ -18,7 +17,6 @@ from rosafe.representations.crosscorrelation import CrossCorrelation
 from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.haircell import InnerHairCell
 from rosafe.representations.ild import Ild
-from rosafe.representations.input import Input
 from rosafe.representations.preproc import PreProc
 from rosafe.representations.ratemap import Ratemap
 
@@ -86,29 +84,6 @@ def test_windows(length: int) -> None:
 
 
 # --- input and pre-processing -----------------------------------------------------------------------------------
-
-
-def test_input_scaling() -> None:
-    block = np.array([[2**31 - 1, -(2**31), 0], [1, 5, -7]], np.int32)
-    np.testing.assert_array_equal(Input(44100).process(block), block / (2**31 - 1))
-    np.testing.assert_array_equal(Input(44100, in_doNormalize=False).process(block), block)
-    np.testing.assert_array_equal(Input(44100, in_normalizeValue=2**64 - 1).process(block), block / 2.0**64)
-
-
-@pytest.mark.parametrize(("rate", "cutoff"), [(16000, 20.0), (44100, 20.0), (48000, 5.0)])
-def test_dc_removal_is_a_butterworth_high_pass(rate: int, cutoff: float) -> None:
-    got = PreProc(rate, pp_bRemoveDC=True, pp_cutoffHzDC=cutoff).process(impulse(4 * rate))[0]
-    frequencies = np.array([cutoff / 2, cutoff, 2 * cutoff, 1000.0])
-    response = np.array([np.sum(got * np.exp(-2j * np.pi * f / rate * np.arange(len(got)))) for f in frequencies])
-    warped = np.tan(np.pi * frequencies / rate) / np.tan(np.pi * cutoff / rate)
-    np.testing.assert_allclose(np.abs(response), warped**4 / np.sqrt(1 + warped**8), rtol=1e-9, atol=1e-9)
-
-
-def test_pre_emphasis_and_level() -> None:
-    x = noise("preProc", 300)
-    stage = PreProc(16000, pp_bPreEmphasis=True, pp_coefPreEmphasis=-0.9, pp_bLevelScaling=True, pp_refSPLdB=94.0)
-    expected = (x - 0.9 * np.pad(x, ((0, 0), (1, 0)))[:, :-1]) * 10**0.3
-    np.testing.assert_allclose(stage.process(x), expected, rtol=1e-14, atol=1e-15)
 
 
 def test_the_order_of_pre_processing() -> None:
@@ -190,67 +165,6 @@ def test_gammatone_impulse_response(rate: int, order: int, width: float) -> None
             assert error.max() < 1e-12 * peak
 
 
-def test_gammatone_has_unit_gain_at_its_centre() -> None:
-    rate, frequency = 16000, 1000.0
-    n = np.arange(4000)
-    tone = np.sin(2 * np.pi * frequency / rate * n) * np.ones((2, 1))
-    bank = Filterbank(rate, fb_cfHz=[frequency])
-    bank.provide = frozenset({"envelope"})
-    bank.process(tone)
-    np.testing.assert_allclose(bank.provided["envelope"][..., 2000:], 1.0, atol=1e-4)  # the image at -f is 80 dB down
-
-
-def drnl_linear_response(frequency: float, rate: float, at: float) -> complex:
-    """Return the response of the linear path by its formula, with the published numbers."""
-    log = math.log10(frequency)
-    z = np.exp(2j * np.pi * at / rate)
-    centre, width = 10 ** (-0.06762 + 1.01679 * log), 10 ** (0.03728 + 0.75 * log)
-
-    def resonator(point: complex) -> complex:
-        decay = math.exp(-2 * math.pi * width / rate)
-        alpha = -decay * math.cos(2 * math.pi * centre / rate)
-        return complex((1 + alpha / point) / (1 + 2 * alpha / point + decay**2 / point**2))
-
-    unit = abs(resonator(complex(np.exp(2j * np.pi * centre / rate))))
-    c = 1 / math.tan(math.pi * 10 ** (-0.06762 + 1.01 * log) / rate)
-    s = c * (z - 1) / (z + 1)
-    lowpass = 1 / (s**2 + math.sqrt(2) * s + 1)
-    return complex(10 ** (4.20405 - 0.47909 * log) * (resonator(z) / unit) ** 2 * lowpass**4)
-
-
-@pytest.mark.parametrize("frequency", [250.0, 1000.0, 4000.0])
-def test_drnl_linear_path_by_its_formula(frequency: float) -> None:
-    rate = 44100.0
-    channel = DrnlBank(rate, np.array([frequency])).channels[0]
-    response = channel.linear.process(impulse(16384)[:1])[0]
-    for at in (0.7 * frequency, frequency, 1.3 * frequency):
-        got = np.sum(response * np.exp(-2j * np.pi * at / rate * np.arange(len(response))))
-        assert got == pytest.approx(drnl_linear_response(frequency, rate, at), rel=1e-9)
-
-
-def test_drnl_compresses_middle_levels_only() -> None:
-    """The input-output curve of the 1 kHz channel: slope 1 at low levels, near 0.25 at middle levels."""
-    rate, frequency = 44100.0, 1000.0
-    tone = np.sin(2 * np.pi * frequency / rate * np.arange(8820)) * np.ones((2, 1))
-    levels = []
-    for velocity in (1e-9, 1e-8, 1e-5, 1e-4):
-        out = np.empty((2, 1, tone.shape[-1]))
-        DrnlBank(rate, np.array([frequency])).process(tone * velocity, with_envelope=False, output=out)
-        levels.append(20 * math.log10(np.abs(out[0, 0, 4410:]).max()))
-    assert levels[1] - levels[0] == pytest.approx(20, abs=0.5)
-    assert levels[3] - levels[2] < 10
-
-
-def test_drnl_broken_stick() -> None:
-    channel = DrnlBank(44100.0, np.array([1000.0])).channels[0]
-    a, b, c = 10 ** (1.40298 + 0.81916 * 3), 10 ** (1.61912 - 0.81867 * 3), 10**-0.60206
-    x = np.array([0.0, 1e-12, -1e-12, 1e-3, -1e-3, 10.0])
-    expected = np.sign(x) * np.minimum(a * np.abs(x), b * np.abs(x) ** c)
-    np.testing.assert_allclose(channel._broken_stick(x), expected, rtol=1e-12)
-    high = DrnlBank(44100.0, np.array([3000.0])).channels[0]
-    assert high.slope == pytest.approx(10 ** (1.40298 + 0.81916 * math.log10(1500)))
-
-
 def test_drnl_envelope_is_exact_for_a_tone_at_the_channel() -> None:
     rate, frequency = 16000.0, 700.0
     bank = Filterbank(rate, fb_cfHz=[frequency], fb_type="drnl")
@@ -295,26 +209,6 @@ def test_hair_cell_methods() -> None:
         stage = InnerHairCell(44100, ihc_method=method)
         got = stage.process(x, envelope if stage.required_extra else None)
         np.testing.assert_allclose(got, values, rtol=0, atol=1e-12 * np.abs(values).max(), err_msg=method)
-
-
-@pytest.mark.parametrize("rate", [16000, 44100, 48000])
-def test_dau1996_is_a_first_order_low_pass_in_closed_form(rate: int) -> None:
-    """Responses of max(x, 0) with the bilinear first-order Butterworth low-pass at 1 kHz, which AMT uses."""
-    stage = InnerHairCell(rate, ihc_method="dau1996")
-    k = np.tan(np.pi * 1000 / rate)
-    gain, pole = k / (1 + k), (1 - k) / (1 + k)
-    n = np.arange(rate // 10)
-    step = np.broadcast_to(1 - (1 - gain) * pole**n, (2, 1, len(n)))
-    np.testing.assert_allclose(stage.process(np.ones(step.shape)), step, rtol=0, atol=1e-13)
-    assert not InnerHairCell(rate, ihc_method="dau1996").process(-np.ones(step.shape)).any()
-    # fundamental of a rectified tone: half its amplitude, reduced by 1/sqrt(1 + (tan(pi f/rate) / k)**2)
-    for frequency in (500, 1000, 4000):
-        tone = np.exp(2j * np.pi * frequency * n / rate)
-        output = InnerHairCell(rate, ihc_method="dau1996").process(np.broadcast_to(tone.real, step.shape))[0, 0]
-        rectified = np.maximum(tone.real, 0)
-        measured = [abs(np.vdot(tone[len(n) // 2 :], x[len(n) // 2 :])) for x in (output, rectified)]
-        expected = 1 / np.sqrt(1 + (np.tan(np.pi * frequency / rate) / k) ** 2)
-        np.testing.assert_allclose(measured[0] / measured[1], expected, rtol=1e-9)
 
 
 def test_bernstein_without_envelope_is_silent() -> None:
@@ -378,24 +272,6 @@ def test_cross_correlation_by_direct_sums(name: str, size: int, hop: int, reach:
 def test_lag_count_is_rounded_up_in_floating_point() -> None:
     lags = {rate: len(CrossCorrelation(rate).derived["cc_lags"]) for rate in (44100, 16000, 48000, 10000)}
     assert lags == {44100: 99, 16000: 37, 48000: 107, 10000: 23}
-
-
-def test_signs() -> None:
-    """A source on the right: the left ear lags and is quieter, so lag and level difference are positive."""
-    source = np.random.default_rng(3).standard_normal(2000)
-    x = np.zeros((2, 1, 1900))
-    x[0, 0], x[1, 0] = 0.5 * source[93:1993], source[100:2000]
-    stage = CrossCorrelation(RATE)
-    correlation = stage.process(x)
-    assert (np.array(stage.derived["cc_lags"])[correlation[0].argmax(axis=0)] == 7 / RATE).all()
-    assert (Ild(RATE).process(x) > 4).all()
-
-
-def test_silence() -> None:
-    zeros = np.zeros((2, 2, 1000))
-    assert not Ild(RATE).process(zeros).any()
-    assert not Ratemap(RATE).process(zeros).any()
-    assert not CrossCorrelation(RATE).process(zeros).any()
 
 
 def test_many_frames_go_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import re
 import pytest
 import yaml
 
-from rosafe.declarations.literature import LITERATURE
+from rosafe.declarations.reference import LITERATURE
 from tests.harness import ROOT
 
 PAPER = (ROOT / "paper" / "paper.md").read_text("utf-8")

@@ -147,7 +147,7 @@ FAULTS: Mapping[str, Fault] = {
         process("return block * self.weights")
         + "\n    def build(self, values, changed):"
         + "\n        self.weights = np.ones((len(self.input_format.center_frequencies), 1))",
-        "fb_nChannels",
+        "5 channels during the sound",
         at_run_time=False,
     ),
     "raises after a change": Fault(
@@ -219,6 +219,12 @@ FAULTS: Mapping[str, Fault] = {
     "parameters raise": Fault(PLAIN, _property("parameters", "raise RuntimeError('never')"), "RuntimeError: never"),
     "built wrongly": Fault(PLAIN, "    def build(self, values, changed):\n        values['other']", "KeyError"),
     "no format": Fault(PLAIN, _property("output_format", "return 100.0"), "output_format: expected a SignalFormat"),
+    "advice raises": Fault(
+        PLAIN, "", "advice: KeyError: 'none'", "advice=lambda values: values['none']", at_run_time=False
+    ),
+    "advice without a text": Fault(
+        PLAIN, "", "advice: expected a text, got None", "advice=lambda values: None", at_run_time=False
+    ),
     "refuses without a name": Fault(
         PLAIN,
         "    def build(self, values, changed):\n        if values['my_factor'] > 3:\n"

@@ -12,7 +12,7 @@ from unittest import mock
 
 import pytest
 
-from tests.harness import ROOT, wait_for
+from tests.harness import wait_for
 from tests.plugins.stages import FRAMED, PLAIN, SAMPLES, Fault, text_of
 from tests.plugins.support import python
 from tests.plugins.test_documents import plugins
@@ -117,60 +117,6 @@ def test_in_a_running_node(world: worlds.World, folder: Path) -> None:
     world.graph.run("rosafe", "setup", "load", str(setup))
     wait_for(lambda: set(NAMES.values()) <= {p["name"] for p in world.http.call("rosAFE/getProcessors")["processors"]})
     world.http.call("rosAFE/Stop")
-
-
-@pytest.mark.exploration
-@pytest.mark.ros
-def test_all_interfaces(world: worlds.World) -> None:
-    def shell(command: str) -> str:
-        return world.graph.run("bash", "-c", f". {ROOT}/scripts/env.sh && {command}").stdout
-
-    changing = "rosservice call /rosAFE/modifyParameter \"{{nameProc: zc2, nameParam: zc_threshold, newValue: '{}'}}\""
-
-    # one request for the whole chain, from the shell
-    reported = json.loads(shell("rosafe request zeroCrossings zc_wSizeSec=0.05 fb_nChannels=4 --json"))
-    assert reported["created"][-1] == "zeroCrossings_0"
-    parent = reported["dependencies"][-2]
-
-    # service, topic and modifyParameter with the commands of ROS
-    assert "genom_success: True" in shell(
-        f"rosservice call /rosAFE/ZeroCrossingsProc '{{name: zc2, upperDepName: {parent}, zc_hSizeSec: 0.02}}'"
-    )
-    assert "numberOfChannels: 4" in shell("rostopic echo -n 1 /rosAFE/zeroCrossingsPort/zc2")
-    refused = shell(changing.format("2"))
-    assert "genom_success: False" in refused
-    assert "e_badNewValue" in refused
-    assert "genom_success: True" in shell(changing.format("0.5"))
-
-    # HTTP: processors, outputs, help
-    (found,) = [p for p in world.http.call("rosAFE/getProcessors")["processors"] if p["name"] == "zc2"]
-    assert (found["kind"], found["upperDepName"], found["rate"]) == ("zeroCrossings", parent, 50.0)
-    assert (found["shape"], found["axes"]) == ([2, 4], ["ear", "channel"])
-    assert {"name": "zc_threshold", "value": "0.5"} in found["parameters"]
-    (part,) = wait_for(
-        lambda: (
-            (parts := world.http.call("rosAFE/getRepresentation", ["zeroCrossings_0"])["parts"])[0]["data"] and parts
-        )
-    )
-    assert (part["name"], part["axes"]) == ("zeroCrossings", ["ear", "channel", "time"])
-    assert max(part["data"]) > 100
-    described = world.http.get("/describe/rosAFE")
-    assert described["representations"]["zeroCrossings"]["parent"] == "gammatone"
-    assert "zeroCrossings" not in world.http.call("rosAFE/getParameters")["parameters"]
-
-    # Tcl: request, port, help
-    lines = world.lines(f"""
-        set g [::genomix::connect $address]
-        $g load rosAFE
-        ::rosAFE::ZeroCrossingsProc {{name zc3 upperDepName {parent}}} &
-        while {{[catch {{::rosAFE::getDependencies {{nameProc zc3}}}}]}} {{after 20}}
-        show [dict get [::rosAFE::zeroCrossingsPort zc3] zeroCrossingsPort numberOfChannels]
-        show [string match *zc_threshold* [::rosAFE::ZeroCrossingsProc -h]]
-    """)
-    assert lines[-2:] == ["4", "1"]
-
-    # and an action
-    assert "/rosAFE/ZeroCrossingsProc/goal" in {topic for topic, _ in world.graph.readers()}
 
 
 @pytest.mark.ros

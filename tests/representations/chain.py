@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Output, Stage, parts_of
 from rosafe.representations import KINDS, STAGES
 from tests import harness
-from tests.dsp.bare import FloatArray, cut, single
+from tests.dsp.bare import FloatArray, cut
 
 
 def kinds_of(name: str) -> list[str]:
@@ -34,33 +33,6 @@ def with_ancestors(outputs: Iterable[str]) -> list[str]:
             needed.add(kind)
             kind = KINDS[kind].parent
     return [kind for kind in STAGES if kind in needed]
-
-
-def check_resets(fresh: Callable[[int], Stage], given: SignalFormat, x: FloatArray, *others: FloatArray) -> None:
-    """Compare a stage after a reset, and after a change of the channels, with a new one from `fresh`."""
-    stage = fresh(x.shape[1])
-    expected = single(stage.process(x))
-    assert expected.shape[-1] > 2
-    stage.reset()
-    np.testing.assert_array_equal(stage.process(x), expected)
-    names = tuple(float(number) for number in range(1, x.shape[1] + 1))
-    stage.set_input_format(replace(given, center_frequencies=names))  # the same number of other channels
-    np.testing.assert_array_equal(stage.process(x), expected)
-    for other in others:
-        np.testing.assert_array_equal(stage.process(other), fresh(other.shape[1]).process(other))
-
-
-def check_fresh_output(stage: Stage, x: FloatArray) -> None:
-    """Check that the output is a new, writable array that is not modified later; `x` is read-only."""
-    x.setflags(write=False)
-    made = single(stage.process(x))
-    assert made.flags.c_contiguous and made.flags.writeable and made.dtype == np.float64
-    assert made.shape[:-1] == stage.output_rows(x.shape[:-1])
-    kept = made.copy()
-    stage.process(x)
-    np.testing.assert_array_equal(made, kept)
-    frame = single(stage.process(x[..., :1]))
-    assert frame.flags.c_contiguous and frame.flags.writeable
 
 
 class Chain:

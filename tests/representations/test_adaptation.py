@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.representations.adaptation import EVEN_TAU, TAU, Adaptation, hearing_threshold
@@ -90,27 +87,6 @@ def test_the_constants() -> None:
     np.testing.assert_allclose(hearing_threshold(at), [22.953, 3.369, -3.388, 4.786], atol=5e-4)
 
 
-@pytest.mark.parametrize("level", [-20.0, 0.0, 35.0, 60.0, 100.0, 110.0])
-def test_the_output_for_steady_sound(level: float) -> None:
-    """Each loop computes the square root: 0 at the threshold and below, 100 at 100 dB."""
-    x = np.full((2, 1, 3000), 10 ** ((level - 100) / 20))
-    stage = Adaptation(RATE, adpt_tau=[0.001, 0.002, 0.003], adpt_lim=0)  # limits have a permanent effect above 100 dB
-    least = 1e-5 ** (1 / 8)
-    expected = 100 * (max(x[0, 0, 0], 1e-5) ** (1 / 8) - least) / (1 - least)
-    assert stage.process(x)[1, 0, -1] == pytest.approx(expected, abs=1e-6 * max(expected, 1e-4))
-
-
-def test_the_limit_of_an_onset() -> None:
-    """An extremely loud onset reaches 1 + m = lim (1 - s**2)."""
-    onset = Adaptation(RATE, adpt_tau=[0.05]).process(np.full((2, 1, 1), 1e20))
-    rest = 1e-5**0.5
-    assert onset[0, 0, 0] == pytest.approx(100 * (10 * (1 - rest**2) - rest) / (1 - rest), rel=1e-12)
-    # an onset just above 1 is not limited
-    x = 1e-5**0.5 * (1 + 1e-5)
-    onset = Adaptation(RATE, adpt_tau=[0.05]).process(np.full((2, 1, 1), x))
-    assert onset[0, 0, 0] == pytest.approx(100 * (1 + 1e-5 - rest) / (1 - rest), rel=1e-12)
-
-
 def test_a_limit_of_one() -> None:
     """lim = 1 / (1 - s**2) makes m 0: the maximum is 1, which is 100."""
     rest = 10 ** (-100 / 40)
@@ -136,62 +112,6 @@ def test_negative_input_counts_as_the_threshold() -> None:
 
 
 # --- streams ----------------------------------------------------------------------------------------------------
-
-MODES: list[tuple[SignalFormat, dict[str, Any]]] = [
-    (SOUND, {}),
-    (SOUND, {"adpt_lim": 0.0, "adpt_tau": [0.01, 0.1, 1.0]}),
-    (SOUND, {"adpt_model": "adt_vandorpschuitman"}),
-    (DRNL, {"adpt_lim": 1.5, "adpt_mindB": 30.0}),
-]
-each_mode = pytest.mark.parametrize(("signal", "parameters"), MODES)
-sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2, 31, 32, 33]), st.integers(0, 200)), min_size=1).filter(any)
-
-
-@each_mode
-@given(sizes=sizes)
-@settings(max_examples=10, database=None)
-def test_block_boundaries_and_prefixes(signal: SignalFormat, parameters: dict[str, Any], sizes: list[int]) -> None:
-    x = sound(400)
-    whole = Adaptation(signal, **parameters).process(x)
-    stage = Adaptation(signal, **parameters)
-    blocks = [stage.process(block) for block in cut(x, sizes)]
-    np.testing.assert_allclose(np.concatenate(blocks, axis=-1), whole, rtol=1e-13, atol=1e-12 * np.abs(whole).max())
-    first = Adaptation(signal, **parameters).process(x[..., : sizes[0]])
-    np.testing.assert_allclose(first, whole[..., : sizes[0]], rtol=1e-13, atol=1e-12 * np.abs(whole).max())
-
-
-@each_mode
-def test_reset_and_other_channels_reset_the_state(signal: SignalFormat, parameters: dict[str, Any]) -> None:
-    stage = Adaptation(signal, **parameters)
-    expected = stage.process(sound(100))
-    stage.reset()
-    np.testing.assert_array_equal(stage.process(sound(100)), expected)
-
-    other = replace(signal, center_frequencies=(3000.0, 300.0), filterbank="gammatone")
-    stage.set_input_format(other)
-    x = sound(100, 1, channels=2)
-    np.testing.assert_array_equal(stage.process(x), Adaptation(other, **parameters).process(x))
-    stage.set_input_format(replace(other, filterbank="drnl"))  # the same channels, by other filters
-    expected = Adaptation(replace(other, filterbank="drnl"), **parameters).process(x)
-    np.testing.assert_array_equal(stage.process(x), expected)
-    if "adpt_model" in parameters:
-        with pytest.raises(ValueError, match=r"^block: expected 2 channels, got 3"):
-            stage.process(sound(10))
-    else:  # without notification
-        fresh = Adaptation(replace(signal, filterbank="drnl"), **parameters)
-        np.testing.assert_array_equal(stage.process(sound(100)), fresh.process(sound(100)))
-
-
-@each_mode
-def test_copies_may_be_changed_and_discarded(signal: SignalFormat, parameters: dict[str, Any]) -> None:
-    expected = Adaptation(signal, **parameters).process(sound(300))
-    stage, made = Adaptation(signal, **parameters), []
-    for block in cut(sound(300), 100):
-        planned = copy.copy(stage)
-        planned.configure(adpt_tau=[1.0], adpt_mindB=3)
-        planned.set_input_format(replace(signal, filterbank="", center_frequencies=(5.0,)))
-        made.append(stage.process(block))
-    np.testing.assert_allclose(np.concatenate(made, axis=-1), expected, rtol=1e-13, atol=1e-12 * np.abs(expected).max())
 
 
 @pytest.mark.filterwarnings("error")
@@ -284,43 +204,15 @@ def test_behind_drnl_in_a_chain() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [
-        {"adpt_lim": -0.1},
-        {"adpt_lim": 1.1e6},
-        {"adpt_lim": math.nan},
-        {"adpt_mindB": 99.1},
-        {"adpt_mindB": 100},
-        {"adpt_mindB": -301},
-        {"adpt_tau": []},
-        {"adpt_tau": [0]},
-        {"adpt_tau": [0.1, 0.0]},
-        {"adpt_tau": [0.1, -1.0]},
-        {"adpt_tau": [3601.0]},
-        {"adpt_tau": [0.1] * 33},
-        {"adpt_tau": "0.1"},
-        {"adpt_model": "adt_jepsen"},
-        {"adpt_model": "dau"},
-        {"adpt_model": 3},
-        {"adpt_model": "adt_vandorpschuitman"},  # channels without frequencies
-    ],
-    ids=str,
+    "changes", [{"adpt_tau": []}, {"adpt_tau": [0.1, 0.0]}, {"adpt_model": "adt_vandorpschuitman"}]
 )
 def test_invalid_values(changes: dict[str, Any]) -> None:
+    """The threshold of hearing needs channels with frequencies."""
     (name,) = changes
-    with pytest.raises(ValueError, match=f"^{name}: "):
-        Adaptation(RATE, **changes)
     stage, reference_stage = Adaptation(RATE), Adaptation(RATE)
-    for each in (stage, reference_stage):
-        each.process(sound(50))
     with pytest.raises(ValueError, match=f"^{name}: "):
-        stage.configure(adpt_lim=5, **changes) if name != "adpt_lim" else stage.configure(adpt_mindB=5, **changes)
-    assert stage.parameters == reference_stage.parameters
+        stage.configure(adpt_lim=5, **changes)
     np.testing.assert_array_equal(stage.process(sound(50)), reference_stage.process(sound(50)))
-
-
-def test_invalid_blocks_raise() -> None:
-    stage = Adaptation(SOUND)
-    for block in (np.zeros((2, 5)), np.zeros((3, 3, 5)), np.zeros((1, 3, 5)), np.zeros((2, 3, 5), complex)):
-        with pytest.raises(ValueError, match=r"^block: "):
-            stage.process(block)
+    if name == "adpt_model":
+        with pytest.raises(ValueError, match=r"^block: expected 3 channels, got 2"):
+            Adaptation(SOUND, **changes).process(sound(10, channels=2))

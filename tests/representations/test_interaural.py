@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from rosafe.dsp.signal_format import SignalFormat
-from rosafe.representations import KINDS
-from rosafe.representations.ic import Ic
-from rosafe.representations.itd import Itd
+from rosafe.representations.itd_ic import Ic, Itd
 
 from .chain import Chain, FloatArray, process, reference
 
@@ -79,29 +77,6 @@ def test_a_peak_that_rounding_flattens() -> None:
     assert ic == 1e-323
 
 
-@pytest.mark.parametrize("delay", [-9, -4, 0, 3, 8])
-def test_the_delay_between_the_ears(delay: int) -> None:
-    """Positive if the left ear lags; the filters ring, so that the peak is between samples."""
-    sound = np.random.default_rng(2).standard_normal(6400)
-    ears = np.stack([np.roll(sound, delay), sound])
-    values = {"fb_cfHz": CHANNELS, "ihc_method": "none", "cc_maxDelaySec": 0.001}
-    made = process(ears, RATE, ["itd", "ic"], values)
-    assert made["itd"].shape == (3, 39)
-    np.testing.assert_allclose(made["itd"][:, 3:], delay / RATE, rtol=0, atol=2e-5)
-    assert made["ic"][:, 3:].min() > 0.98
-    assert made["itd_frameRate"] == made["ic_frameRate"] == 100.0
-
-
-def test_coherence_of_a_mixture() -> None:
-    """Noise with a fraction p of its power common to both ears: the coherence is about p."""
-    rng = np.random.default_rng(4)
-    common, own = rng.standard_normal(48000), rng.standard_normal((2, 48000))
-    values = {"fb_cfHz": [4000.0], "ihc_method": "none", "cc_wSizeSec": 0.5, "cc_hSizeSec": 0.5}
-    for part in (0.3, 0.7, 1.0):
-        ears = np.sqrt(part) * common + np.sqrt(1 - part) * own
-        assert np.median(process(ears, RATE, ["ic"], values)["ic"]) == pytest.approx(part, abs=0.07)
-
-
 def test_one_silent_ear() -> None:
     sound = np.random.default_rng(2).standard_normal(3200)
     made = process(np.stack([sound, 0 * sound]), RATE, ["itd", "ic"], {"fb_cfHz": CHANNELS})
@@ -118,19 +93,3 @@ def test_lags_may_change() -> None:
     wide = process(sound, RATE, ["itd", "ic"], {"fb_cfHz": CHANNELS, "cc_maxDelaySec": 0.02})
     np.testing.assert_allclose(made["itd"][:, 19:], wide["itd"][:, 19:], rtol=0, atol=1e-12)
     assert chain.stages["itd"].output_format == replace(chain.stages["crossCorrelation"].output_format, lags=0)
-
-
-@pytest.mark.parametrize("kind", [Itd, Ic])
-def test_there_are_no_parameters(kind: type[Itd] | type[Ic]) -> None:
-    stage = kind(GIVEN)
-    assert stage.parameters == {}
-    with pytest.raises(ValueError, match=r"^cc_wname: "):
-        stage.configure(cc_wname="hann")
-
-
-def test_declarations() -> None:
-    for kind, request, unit in (("itd", "ItdProc", "s"), ("ic", "IcProc", "")):
-        declared = KINDS[kind]
-        assert (declared.request, declared.parent, declared.port) == (request, "crossCorrelation", f"{kind}Port")
-        assert (declared.parts[0].axes, declared.parts[0].unit) == (("channel", "time"), unit)
-        assert declared.binaural

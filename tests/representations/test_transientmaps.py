@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe.dsp.signal_format import SignalFormat
-from rosafe.representations import KINDS
 from rosafe.representations.onset_offset_maps import MIN_HISTORY_FRAMES, OffsetMap, OnsetMap
 from tests.dsp.implementations import NUMPY, Choice, using
 
@@ -364,26 +363,6 @@ def test_the_kernel_equals_the_numpy_implementation(level: Choice, number: int, 
 # --- invalid values ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [OnsetMap, OffsetMap])
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *(("trm_minStrengthdB", value) for value in (-1e-9, 1000.1, math.nan)),
-        *(("trm_minSpread", value) for value in (0, 1025, -1, 2.5, "5")),
-        *(("trm_fuseWithinSec", value) for value in (-0.01, 10.01, math.inf)),
-        *(("trm_minValuedB", value) for value in (-2000.1, 1000.1, None)),
-    ],
-)
-def test_invalid_values(kind: type[OnsetMap] | type[OffsetMap], name: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"^{name}: "):
-        kind(GIVEN, **{name: value})
-    stage = kind(GIVEN)
-    with pytest.raises(ValueError, match=f"^{name}: "):
-        stage.configure(**{name: value})
-    assert stage.parameters == DEFAULTS
-    assert stage.look_ahead == 10
-
-
 def test_too_many_frames() -> None:
     with pytest.raises(ValueError, match=r"^trm_fuseWithinSec: expected at most 2147483647 samples, got 1e\+10"):
         OnsetMap(replace(GIVEN, rate=1e9), trm_fuseWithinSec=10.0)
@@ -391,15 +370,3 @@ def test_too_many_frames() -> None:
     with pytest.raises(ValueError, match=r"^trm_fuseWithinSec: expected at most 2147483647 samples, got 1e\+10"):
         stage.set_input_format(replace(GIVEN, rate=1e9))
     assert stage.output_format.rate == 100.0
-
-
-def test_declarations() -> None:
-    for kind, request, parent in (
-        ("onsetMap", "OnsetMapProc", "onsetStrength"),
-        ("offsetMap", "OffsetMapProc", "offsetStrength"),
-    ):
-        declared = KINDS[kind]
-        assert (declared.request, declared.port, declared.parent) == (request, f"{kind}Port", parent)
-        assert {p.name: p.default for p in declared.parameters} == DEFAULTS
-        assert [p.idl for p in declared.parameters] == ["double", "unsigned long", "double", "double"]
-        assert declared.parts[0].axes == ("ear", "channel", "time")

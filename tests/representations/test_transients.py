@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
-from rosafe.representations import KINDS
 from rosafe.representations.onset_offset_strength import OffsetStrength, OnsetStrength
 
 from .chain import Chain, FloatArray, reference
@@ -118,22 +116,3 @@ def test_other_steps_of_the_ratemap_keep_the_last_level(kind: type[Stage], limit
     stage.set_input_format(SignalFormat(RATE, 50.0, True, 320, 640, (500.0, 900.0), "gammatone"))
     assert stage.output_format.rate == 50.0
     np.testing.assert_allclose(stage.process(rates([sign * 9])), 9.0, rtol=1e-13)
-
-
-@both
-@pytest.mark.parametrize("value", [0, -30.0, 1000.5, math.nan, math.inf, "much", None, [3.0]])
-def test_invalid_limits(kind: type[Stage], limit: str, sign: int, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"^{limit}: "):
-        kind(GIVEN, **{limit: value})
-    stage = kind(GIVEN)
-    with pytest.raises(ValueError, match=f"^{limit}: "):
-        stage.configure(**{limit: value})
-    assert stage.parameters == {limit: 30.0}
-
-
-def test_declarations() -> None:
-    for kind, request in (("onsetStrength", "OnsetProc"), ("offsetStrength", "OffsetProc")):
-        declared = KINDS[kind]
-        assert (declared.request, declared.name, declared.port) == (request, kind, f"{kind}Port")
-        assert (declared.parent, declared.parts[0].axes) == ("ratemap", ("ear", "channel", "time"))
-        assert declared.parts[0].unit == "dB"

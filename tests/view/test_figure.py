@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import matplotlib
@@ -13,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import rosafe
-from rosafe.system.output import OutputError
 from rosafe.view import figure
 from rosafe.view.axes import save
 from rosafe.view.representations import Representations
@@ -50,16 +48,6 @@ def test_the_figure_of_the_scene(walk: Representations, tmp_path: Path) -> None:
     assert len(np.unique((image * 255).astype(np.uint8).reshape(-1, 3), axis=0)) > 500
     texts = {label.get_text() for label in drawing.texts}
     assert {"A walk", "three seconds"} <= texts
-
-
-def test_axes_are_labelled_with_centre_frequencies(walk: Representations) -> None:
-    drawing = figure.draw(walk, "")
-    for text in ("Left ear", "Right ear", "level difference"):
-        axes = axes_with(drawing, text)
-        labels = [label.get_text() for label in axes.get_yticklabels()]
-        assert labels[0] == "80" and labels[-1] == "7641"
-        for tick, label in zip(axes.get_yticks(), labels, strict=True):
-            assert float(label) == pytest.approx(walk.center_frequencies[int(tick)], abs=0.5)
 
 
 def test_images_show_the_data(walk: Representations) -> None:
@@ -116,28 +104,6 @@ def test_any_number_of_channels(channels: int, tmp_path: Path) -> None:
 def test_too_few_frames_are_rejected(walk: Representations) -> None:
     with pytest.raises(ValueError, match="expected at least 2 frames, got 1"):
         figure.draw(tail(walk, 0.0), "")
-
-
-def test_a_failed_save_keeps_the_old_file(
-    walk: Representations, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawing = figure.draw(tail(walk, 0.5), "")
-    path = tmp_path / "old.png"
-    path.write_bytes(b"old")
-
-    def full(*arguments: object, **options: object) -> None:
-        raise OSError(28, os.strerror(28))
-
-    monkeypatch.setattr(drawing, "savefig", full)
-    with pytest.raises(OutputError, match="No space"):
-        save(drawing, path)
-    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
-
-
-def test_a_saved_file_has_default_permissions(walk: Representations, tmp_path: Path) -> None:
-    save(figure.draw(tail(walk, 0.5), ""), tmp_path / "a.png")
-    (tmp_path / "b").touch()
-    assert (tmp_path / "a.png").stat().st_mode == (tmp_path / "b").stat().st_mode
 
 
 def test_matplotlib_settings_of_the_user_have_no_effect(walk: Representations, tmp_path: Path) -> None:

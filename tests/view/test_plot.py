@@ -79,12 +79,13 @@ def test_interaural_differences(result: dict[str, Any], ax: Axes) -> None:
     assert float(ax.get_yticklabels()[0].get_text()) == 80 and len(ax.get_yticks()) > 4
 
 
-@pytest.mark.parametrize(("name", "decibels"), [("ratemap", 10), ("ihc", 20), ("gammatone", 20)])
+@pytest.mark.parametrize(("name", "decibels"), [("ratemap", 10), ("ratemap", 20), ("ihc", 20), ("gammatone", 20)])
 @pytest.mark.parametrize("ear", ["left", "right"])
 def test_levels_are_relative_to_the_loudest_of_both_ears(
     result: dict[str, Any], ax: Axes, name: str, decibels: int, ear: str
 ) -> None:
-    plot(result, name, ax, ear=ear)
+    magnitude = {"rm_scaling": "magnitude"} if (name, decibels) == ("ratemap", 20) else {}
+    plot({**result, "parameters": magnitude or np.array("{}")}, name, ax, ear=ear)
     size = np.abs(result[name])
     level = np.maximum(decibels * np.log10(np.maximum(size, 1e-200) / size.max()), -60)[int(ear == "right")]
     if name == "ratemap":
@@ -200,12 +201,6 @@ def test_a_figure_of_pyplot(result: dict[str, Any]) -> None:
         figure = rosafe.plot(result, "ild")
         assert figure.number in pyplot.get_fignums()
         pyplot.close(figure)
-
-
-def test_times_in_the_result_have_priority(result: dict[str, Any], ax: Axes) -> None:
-    times = 7.0 + np.arange(result["itd"].shape[-1]) / 100
-    plot({**result, "itd_time": times}, "itd", ax)
-    assert ax.get_xlim() == pytest.approx((times[0] - 0.005, times[-1] + 0.005))
 
 
 def test_the_sample_rate(result: dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.declarations.parameter import Parameter
 from rosafe.dsp.plugin_checks import plugin_of
-from rosafe.interface.remarks import short_window
+from rosafe.interface.remarks import advice
 from rosafe.ros1.component.activities import TaskStatistics
 from rosafe.ros1.transport import master
 from rosafe.ros1.transport.log_throttle import ThrottledLog
@@ -107,7 +107,7 @@ class ChoiceFallbacks:
     def __init__(self, strict: bool) -> None:
         self._strict = strict
         self._warnings: dict[Processor, dict[str, str]] = {}  # by the name of the parameter
-        self._checked_windows: set[Processor] = set()
+        self._advised: set[Processor] = set()
         self._lock = threading.Lock()
 
     def resolving(self, warnings: dict[str, str]) -> Callable[[Parameter, Any], Any]:
@@ -132,25 +132,29 @@ class ChoiceFallbacks:
             if any(stored.values()):
                 self._warnings[processor] = {name: warning for name, warning in stored.items() if warning}
         lines = [f"{processor.name}: {warning}" for warning in warnings.values() if warning]
-        for line in [*lines, *self._window_warnings(processor)]:
+        for line in [*lines, *self._advice(processor)]:
             rospy.logwarn(line)
         return "; ".join(lines)
 
-    def _window_warnings(self, processor: Processor) -> list[str]:
-        """Return the warning about a window that is too short for the pitch range, once for each processor."""
-        if processor.kind != "pitch" or processor.parent is None or processor in self._checked_windows:
+    def _advice(self, processor: Processor) -> list[str]:
+        """Return the declared warning about valid but unsuitable values, once for each processor."""
+        if processor in self._advised:
             return []
         with self._lock:
-            self._checked_windows.add(processor)
-        window = processor.parent.stage.parameters["ac_wSizeSec"]
-        text = short_window(processor.stage.parameters["pi_rangeHz"], window)
+            self._advised.add(processor)
+        values: dict[str, Any] = {}
+        ancestor: Processor | None = processor
+        while ancestor is not None:
+            values |= ancestor.stage.parameters
+            ancestor = ancestor.parent
+        text = advice(processor.kind, values)
         return [f"{processor.name}: {text}"] if text else []
 
     def forget(self, processor: Processor) -> None:
         """Remove the warnings of a processor that has ended."""
         with self._lock:
             self._warnings.pop(processor, None)
-            self._checked_windows.discard(processor)
+            self._advised.discard(processor)
 
     @property
     def lines(self) -> list[str]:

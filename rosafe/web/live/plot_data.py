@@ -12,7 +12,6 @@ import numpy as np
 
 from rosafe.audio.files.windows import MAX_RATE
 from rosafe.interface import KINDS, LAYOUTS, Representation
-from rosafe.view.levels import LEVELS
 
 MAX_COLUMN_RATE = 100.0  # columns per second
 MAX_ROWS = 128  # of an ear: more than the screen shows
@@ -134,7 +133,7 @@ class PlotLayout:
         self.ears = 2 if "ear" in kind.parts[part].axes else 1
         self.group = max(1, math.ceil(processor.rate / MAX_COLUMN_RATE - 1e-9))
         self.rate = processor.rate / self.group
-        self._decibels = _decibels(processor)
+        self._decibels = kind.decibels(processor.values)
         self._bundle = 1  # rows of the output in one row of the plot
         self._axis = ""  # of the rows of an ear
         self._labels: list[Any] = []  # of these rows
@@ -221,12 +220,6 @@ class PlotLayout:
             floor = FLOOR_POWER ** (10.0 / self._decibels)
             array = self._decibels * np.log10(np.maximum(np.abs(array), floor))
         return array
-
-
-def _decibels(processor: ProcessorInfo) -> float:
-    """Return the dB per decade of values that are shown as levels, or 0."""
-    factor = 2.0 if processor.kind == "ratemap" and processor.values.get("rm_scaling") == "magnitude" else 1.0
-    return factor * LEVELS.get(processor.kind, 0.0)
 
 
 def _mean_label(labels: Sequence[Any]) -> Any:

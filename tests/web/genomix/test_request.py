@@ -102,7 +102,7 @@ def _settled(world: World, first: str, second: str) -> dict[str, Any]:
 
 
 def test_matching_processors_are_reused(sound: World) -> None:
-    """tests/ros1/client/test_trees.py has the rules."""
+    """tests/tree/test_requests.py has the rules."""
     call = sound.http.call
     assert call("rosAFE/request", ["ild", {"fb_nChannels": 3}])["created"] == CHAIN
     assert call("rosAFE/request", ["ild", {"fb_nChannels": "3"}])["reused"] == CHAIN

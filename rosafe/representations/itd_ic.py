@@ -1,4 +1,4 @@
-"""Interpolation of peaks by the parabola through the largest value and its neighbours, and stages based on it."""
+"""The interaural time difference and coherence stages: lag and height of the peak of the cross-correlation."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .numeric_limits import FloatArray
-from .signal_format import SignalFormat
-from .stage import Stage
+from rosafe.declarations.reference import cite
+from rosafe.declarations.representation import Representation
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.dsp.signal_format import SignalFormat
+from rosafe.dsp.stage import Stage
 
 
 def vertex_offset(before: FloatArray, value: FloatArray, after: FloatArray) -> FloatArray:
@@ -68,3 +70,50 @@ class PeakStage(Stage):
     @cached_property
     def output_format(self) -> SignalFormat:
         return replace(self.input_format, lags=0)
+
+
+class Itd(PeakStage):
+    """Interaural time difference in s, (C, L, F) to (C, F); positive if the left ear lags, for sources on the right.
+
+    (i - M + d) / fs, with i the index of the first maximum of the correlations c[0] to c[2M], and d = (c[i-1] -
+    c[i+1]) / (c[i-1] - 2 c[i] + c[i+1]) / 2 the top of the parabola through it and its neighbours, 0 at both ends. The
+    result is 0 if all correlations are equal, as in silence.
+    """
+
+    REPRESENTATION = Representation(
+        kind="itd",
+        doc="Interaural time difference",
+        parent="crossCorrelation",
+        axes=("channel", "time"),
+        unit="s",
+        port_doc="Interaural time differences (s), in `left`",
+        references=(cite("may2011"),),
+    )
+
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
+        correlations = self._as_valid_block(block)
+        peaks = ParabolicPeaks.find(correlations)
+        lags = peaks.place - correlations.shape[1] // 2 + peaks.offset
+        lags[peaks.flat] = 0.0
+        lags /= self.sample_rate
+        return lags
+
+
+class Ic(PeakStage):
+    """Interaural coherence, (C, L, F) to (C, F): the height of the peak of the correlation.
+
+    c[i] - (c[i-1] - c[i+1]) d / 4, with i and d as in `Itd`; c[i] at the ends of the lags.
+    The top of a parabola may be slightly above 1. Silence gives 0.
+    """
+
+    REPRESENTATION = Representation(
+        kind="ic",
+        doc="Interaural coherence",
+        parent="crossCorrelation",
+        axes=("channel", "time"),
+        port_doc="Interaural coherences, in `left`",
+        references=(cite("faller2004"),),
+    )
+
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
+        return ParabolicPeaks.find(self._as_valid_block(block)).height
