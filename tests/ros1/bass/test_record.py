@@ -116,11 +116,8 @@ def test_invalid_arguments_change_nothing(wav: Path, tmp_path: Path, capsys: pyt
         direct_result(capsys, *device, "--rate", "-5"), "expected a whole number from 1 to 768000, got '-5'", code=2
     )
     refused(direct_result(capsys, *device, "--topic", "/x"), "not allowed with", code=2)
-    refused(direct_result(capsys, "--socket", "nowhere"), "expected HOST:PORT", code=2)
-    refused(direct_result(capsys, "--socket", "127.0.0.1:9"), "needs --rate", code=2)
     refused(rosafe("record", kept, "--force", "--device", "file:missing.wav"), "missing.wav: No such file")
     refused(rosafe("record", kept, "--force", *device, "--rate", "44100"), "expected 44100 Hz, got 8000 Hz")
-    refused(rosafe("record", "--socket", f"127.0.0.1:{free_port()}", "--rate", "8000"), "Connection refused")
     uri = f"http://127.0.0.1:{free_port()}"
     refused(rosafe("record", ROS_MASTER_URI=uri), f"no ROS master at {uri}", "or record from a --device without ROS")
     assert kept.read_text() == "precious"
@@ -229,26 +226,6 @@ def test_topic_to_wav_and_bag(graph: Graph, capturing: Process, tmp_path: Path) 
     newest = [int(message.lastFrameIndex) for message in messages]
     at = find(np.stack([messages[-1].left[-400:], messages[-1].right[-400:]]))
     assert newest[-1] == at + 400 and np.all(np.diff(newest) == 400)  # frame indices of the stream
-
-
-def test_dedicated_socket_to_wav(graph: Graph, capturing: Process, tmp_path: Path) -> None:
-    import rospy
-
-    graph.client()
-    port = free_port()
-    rospy.set_param("/recorded/socket_port", port)
-    acquire(graph)
-    assert graph.call("/recorded/DedicatedSocket").genom_success
-    address = ("--socket", f"127.0.0.1:{port}", "--rate", str(RATE))
-    done = rosafe("record", "a.wav", *address, "--seconds", "0.3", cwd=tmp_path)
-    assert done.returncode == 0 and "0 frames lost" in done.stdout, done
-    find(samples_of(tmp_path / "a.wav"))
-    with start("record", "b.wav", *address, "-q", cwd=tmp_path) as recording:
-        wait_for_sound(tmp_path / "b.wav", recording)
-        assert graph.call("/recorded/CloseSocket").genom_success
-        assert recording.wait() == 1
-        assert recording.err == f"rosafe record: 127.0.0.1:{port}: bass has closed the connection\n"
-    find(samples_of(tmp_path / "b.wav"))
 
 
 def test_new_acquisition_ends_the_recording(graph: Graph, capturing: Process, tmp_path: Path) -> None:
