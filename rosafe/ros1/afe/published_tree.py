@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from typing import Any
 
 from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError
 from rosafe.ros1.afe.choice_fallbacks import ChoiceFallbacks
-from rosafe.ros1.afe.ports import OutputPort, OutputPorts, element
+from rosafe.ros1.afe.ports import OutputPort, element
 from rosafe.ros1.afe.processor_health import ProcessorHealth
 from rosafe.ros1.component import serialization
 from rosafe.ros1.component.activities import Activity
@@ -55,7 +56,11 @@ class PublishedTree:
         self._choices = choices
         self._captured = captured
         self._catch_up = catch_up
-        self._ports = OutputPorts()
+        self._ports: dict[Processor, OutputPort] = {}
+        self._subscribed: tuple[Processor, ...] | None = (
+            None  # with subscribers; None: look again
+        )
+        self._subscribed_lock = threading.Lock()
         self._activities: dict[Processor, Activity] = {}
         self._input_port = self._advertise("input")
         self._time_class = serialization.message_class("rosAFE", "::rosAFE::frameTime")
@@ -89,15 +94,24 @@ class PublishedTree:
 
         It is infinite if no port has subscribers, and 0 if each block is needed.
         """
-        if self._ports.observed:
+        if any(processor.observers for processor in tuple(self._ports)[:1]):  # observers are to see each block
             return 0
-        subscribed = self._ports.subscribed
+        subscribed = self._subscribed
+        if subscribed is None:
+            with self._subscribed_lock:
+                ports = tuple(self._ports.items())
+                subscribed = self._subscribed = tuple(one for one, port in ports if port.has_subscribers)
         if not subscribed:
             return 0 if self._frame_time.has_subscribers else math.inf
         released = [processor.last_block for processor in subscribed]
         if any(block is None or block.signal.hop <= block_frames for block in released):
             return 0
         return min(map(next_output, subscribed))
+
+    def _forget_subscribed(self) -> None:
+        """Look for subscribers again. Called after each change of the ports and of their subscribers."""
+        with self._subscribed_lock:
+            self._subscribed = None
 
     # --- events of the tree, on its threads ---
 
@@ -108,7 +122,8 @@ class PublishedTree:
         else:
             publisher = self._advertise(processor.kind, processor.name)
             port = OutputPort(processor, publisher, publisher.unregister)
-        self._ports.add(processor, port)
+        self._ports[processor] = port
+        self._forget_subscribed()
         self.health.added(processor, self._meters[processor.kind])
         port.publish()
 
@@ -132,7 +147,8 @@ class PublishedTree:
     def on_removed(self, processor: Processor) -> None:
         """Close the port and end the activity."""
         self.health.ended(processor)
-        port = self._ports.remove(processor)
+        port = self._ports.pop(processor, None)
+        self._forget_subscribed()
         if port is not None:  # otherwise it could not be opened
             port.close()
         activity = self._activities.get(processor)
@@ -143,5 +159,5 @@ class PublishedTree:
         message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
         publisher = self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
         publisher.impl.on_connection = self._catch_up
-        publisher.impl.on_subscribers_changed = self._ports.forget_subscribed
+        publisher.impl.on_subscribers_changed = self._forget_subscribed
         return publisher

@@ -21,8 +21,6 @@ import rospy
 from rospy import topics
 from rospy.impl.registration import Registration, get_topic_manager
 
-from rosafe.ros1.transport.buffer_list import BufferList
-
 # Limits of one subscriber's queue. Windows overlap: the next message of a long port replaces a lost one, and the newest
 # one suffices. Messages of short ports are small, and several can be queued.
 MAX_QUEUED = 32
@@ -30,6 +28,21 @@ MAX_QUEUED_BYTES = 16_000_000
 DIRECT_BYTES = 2**16  # a message up to this length is sent directly, without the thread, if the system accepts it
 _LENGTH = struct.Struct("<I")
 _MAX_PIECES = os.sysconf("SC_IOV_MAX")  # of one sendmsg
+
+
+class BufferList:
+    """A serialized message as buffers for one `sendmsg`. The buffers are not copied and must not change."""
+
+    def __init__(self) -> None:
+        self.pieces: list[Any] = []
+        self.size = 0  # bytes
+
+    def write(self, data: Any, /) -> None:
+        """Append the bytes of a contiguous buffer."""
+        size = len(data) if isinstance(data, (bytes, bytearray)) else data.nbytes
+        if size:
+            self.pieces.append(data)
+            self.size += size
 
 
 class Publisher(rospy.Publisher):

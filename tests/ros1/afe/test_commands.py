@@ -153,18 +153,3 @@ def test_goals_from_the_shell(session: Graph) -> None:
         wait_for(lambda: "/rosAFE/ildPort/from_shell" in session.topics())
         session.run("rostopic", "pub", "-1", "/rosAFE/IldProc/cancel", "actionlib_msgs/GoalID", "{id: shell}")
         wait_for(lambda: "/rosAFE/ildPort/from_shell" not in session.topics())
-
-
-def test_rosnode_kill(graph: Graph) -> None:
-    with graph.node("rosAFE-ros", "-i", "ended") as process:
-        wait_for(lambda: "ready as /ended" in process.err)  # not before the node has started
-        graph.run("rosnode", "kill", "/ended")
-        assert process.wait() == 0
-        assert "Traceback" not in process.err
-        assert "/ended" not in graph.nodes()
-
-
-def test_the_kill_request(graph: Graph) -> None:
-    with graph.node("rosAFE-ros", "-i", "ended") as process:
-        call(graph, "/ended/kill", "{}")
-        assert process.wait() == 0

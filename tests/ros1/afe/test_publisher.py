@@ -26,8 +26,14 @@ from rospy.impl.tcpros_pubsub import TCPROSPub
 from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.ros import array_msg
 from rosafe.ros1.transport import publisher
-from rosafe.ros1.transport.buffer_list import BufferList
-from rosafe.ros1.transport.publisher import MAX_QUEUED, MAX_QUEUED_BYTES, NewestMessage, Publisher, send_pieces
+from rosafe.ros1.transport.publisher import (
+    MAX_QUEUED,
+    MAX_QUEUED_BYTES,
+    BufferList,
+    NewestMessage,
+    Publisher,
+    send_pieces,
+)
 from tests.harness import PATIENCE, PYTHON, ROOT, Graph, Process, freeze, proc, wait_for
 from tests.ros1.afe.session import Session, noise, own_node
 
