@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 from rosafe.audio.devices import alsa, libasound, open_source
-from rosafe.audio.devices.alsa import AlsaSource
-from rosafe.audio.devices.pcm import DeviceBusyError
+from rosafe.audio.devices.alsa import AlsaSource, DeviceBusyError
 from rosafe.interface import ComponentError
 from rosafe.ros1.transport import paths
 

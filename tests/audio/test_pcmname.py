@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from rosafe.audio.devices import open_source
 from rosafe.audio.devices.alsa import AlsaSource
-from rosafe.audio.devices.pcmname import checked_name
+from rosafe.audio.devices.libasound import checked_name
 from rosafe.interface import ComponentError
 from rosafe.ros1.transport import paths
 from tests.harness import PYTHON, ROOT
