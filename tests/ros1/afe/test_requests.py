@@ -438,32 +438,6 @@ def test_errors_are_valid_json_for_any_name(afe: Session) -> None:
         assert body["ex"] == "::rosAFE::e_badNewValue" and repr(name) in body["detail"]["what"]
 
 
-def test_eight_simultaneous_clients(afe: Session) -> None:
-    """Each builds, queries, modifies and removes its own branch; the tree is consistent in the end."""
-    microphone = afe.build("PreProc", block=400)
-
-    def work(number: int) -> None:
-        for _ in range(3):
-            name = f"g{number}"
-            afe.ok("GammatoneProc", name=name, fb_nChannels=2)
-            afe.ok("IhcProc", name=f"i{number}", upperDepName=name)
-            afe.ok("IldProc", name=f"l{number}", upperDepName=f"i{number}")
-            assert afe.ok("getDependencies", nameProc=f"l{number}").dependencies[-3:] == [
-                name,
-                f"i{number}",
-                f"l{number}",
-            ]
-            afe.ok("modifyParameter", nameProc=f"i{number}", nameParam="ihc_method", newValue="halfwave")
-            assert afe.refused("GammatoneProc", name=name)[0] == "::rosAFE::e_existsAlready"
-            afe.ok("getSignals")
-            afe.ok("removeProcessor", name=name)
-
-    harness.run_together(8, work)
-    assert afe.processors() == {"input": ["input"], "preProc": ["preProc"]}
-    microphone.play(noise(400))
-    afe.read("preProc", 401)
-
-
 def test_simultaneous_requests_for_one_name_create_one_processor(afe: Session) -> None:
     afe.build("PreProc")
     responses = harness.run_together(8, lambda _: afe.call("GammatoneProc", fb_nChannels=2))
