@@ -113,8 +113,8 @@ def misbehaviours(name: str) -> Iterator[Misbehaviour]:
     yield Misbehaviour("XML-RPC", packed, answer=b"HTTP/1.1 501")
     call = xmlrpc.client.dumps(([{"methodName": "getBusInfo", "params": ["/evil"]}] * 100,), "system.multicall")
     deep = "<methodCall><methodName>getPid</methodName><params><param>" + "<value><array><data>" * 8000
-    for body in (call, deep):
-        yield Misbehaviour("XML-RPC", post(body.encode()), answer=b"<fault>")
+    for text in (call, deep):
+        yield Misbehaviour("XML-RPC", post(text.encode()), answer=b"<fault>")
     body = xmlrpc.client.dumps(("/hasty",), "getPid").encode()  # a client that does not read its answers
     yield Misbehaviour("XML-RPC", b"", flood=post(body).replace(b"Connection: close\r\n", b"") * 1000)
 

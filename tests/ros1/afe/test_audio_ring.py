@@ -246,27 +246,6 @@ def test_malformed_messages_change_nothing_and_are_reported_once(bad: Any, why: 
     assert len(lines) == 2, "another event, reported again"
 
 
-def test_a_too_long_window_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rosafe.audio.files.windows.MAX_WINDOW", 100)
-    lines: list[str] = []
-    feed = AudioRing(lines.append).connect()
-    feed(message(RATE, 5, np.zeros(101, np.int32)))
-    assert "got 101" in lines[0]
-
-
-def test_losses_are_located_and_timed() -> None:
-    lines: list[str] = []
-    ring = AudioRing(lines.append)
-    feed = ring.connect()
-    source = Source(index=100)
-    feed(source.message())
-    opened(ring, 4)
-    source.index += 20  # of which the window contains 12
-    feed(source.message())
-    assert ring.counters.last_loss == "8 frames from frame 101 on"
-    assert lines == ["Audio: lost 8 frames from frame 101 on (1.000 s)"]
-
-
 def test_events_are_reported_as_text() -> None:
     lines: list[str] = []
     ring = AudioRing(lines.append)

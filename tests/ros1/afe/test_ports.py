@@ -140,17 +140,6 @@ def test_two_of_a_kind_and_names_with_a_slash(afe: Session) -> None:
     assert afe.read("gammatone", BLOCK + 1).numberOfChannels == 3
 
 
-def test_a_child_starts_with_the_last_released_block(afe: Session) -> None:
-    microphone = afe.build("PreProc", block=BLOCK)
-    signal = noise(2 * BLOCK)
-    microphone.play(signal)
-    afe.read("preProc", 2 * BLOCK + 1)
-    afe.ok("GammatoneProc", fb_nChannels=2)
-    message = afe.read("gammatone", 2 * BLOCK + 1)
-    truth = expected(signal[:, BLOCK:], BLOCK, {"fb_nChannels": 2})
-    assert_holds(message, "gammatone", windowed(truth["gammatone"], 1.0, RATE))
-
-
 def test_the_data_object_is_advertised_and_silent(afe: Session) -> None:
     microphone = afe.build("PreProc", block=BLOCK)
     with afe.graph.collect("/rosAFE/dataObj", serialization.message_class("rosAFE", "::rosAFE::dataObjSt")) as messages:

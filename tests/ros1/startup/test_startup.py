@@ -380,14 +380,6 @@ def test_the_shells_process_is_the_node(graph: Graph) -> None:
         assert node.out == ""
 
 
-@FORKS
-def test_ends_without_the_master(private_graph: tuple[Graph, MasterProcess]) -> None:
-    graph, master = private_graph
-    with graph.node("bass-ros") as node:
-        master.kill()
-        assert node.stop(signal.SIGTERM) == 0
-
-
 # --- names ------------------------------------------------------------------------------------------------------
 
 
