@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -57,10 +56,6 @@ class PublishedTree:
         self._captured = captured
         self._catch_up = catch_up
         self._ports: dict[Processor, OutputPort] = {}
-        self._subscribed: tuple[Processor, ...] | None = (
-            None  # with subscribers; None: look again
-        )
-        self._subscribed_lock = threading.Lock()
         self._activities: dict[Processor, Activity] = {}
         self._input_port = self._advertise("input")
         self._time_class = serialization.message_class("rosAFE", "::rosAFE::frameTime")
@@ -96,22 +91,13 @@ class PublishedTree:
         """
         if any(processor.observers for processor in tuple(self._ports)[:1]):  # observers are to see each block
             return 0
-        subscribed = self._subscribed
-        if subscribed is None:
-            with self._subscribed_lock:
-                ports = tuple(self._ports.items())
-                subscribed = self._subscribed = tuple(one for one, port in ports if port.has_subscribers)
+        subscribed = [processor for processor, port in tuple(self._ports.items()) if port.has_subscribers]
         if not subscribed:
             return 0 if self._frame_time.has_subscribers else math.inf
         released = [processor.last_block for processor in subscribed]
         if any(block is None or block.signal.hop <= block_frames for block in released):
             return 0
         return min(map(next_output, subscribed))
-
-    def _forget_subscribed(self) -> None:
-        """Look for subscribers again. Called after each change of the ports and of their subscribers."""
-        with self._subscribed_lock:
-            self._subscribed = None
 
     # --- events of the tree, on its threads ---
 
@@ -123,7 +109,6 @@ class PublishedTree:
             publisher = self._advertise(processor.kind, processor.name)
             port = OutputPort(processor, publisher, publisher.unregister)
         self._ports[processor] = port
-        self._forget_subscribed()
         self.health.added(processor, self._meters[processor.kind])
         port.publish()
 
@@ -148,7 +133,6 @@ class PublishedTree:
         """Close the port and end the activity."""
         self.health.ended(processor)
         port = self._ports.pop(processor, None)
-        self._forget_subscribed()
         if port is not None:  # otherwise it could not be opened
             port.close()
         activity = self._activities.get(processor)
@@ -159,5 +143,4 @@ class PublishedTree:
         message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
         publisher = self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
         publisher.impl.on_connection = self._catch_up
-        publisher.impl.on_subscribers_changed = self._forget_subscribed
         return publisher

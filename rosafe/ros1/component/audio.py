@@ -195,7 +195,7 @@ class AudioRing:
         self._refusing = True
 
     def _join_stream(self, sample_rate: int, newest: int, window: int) -> None:
-        """Continue the stream if frame `newest` belongs to it, else begin a new one."""
+        """Continue the stream if frame `newest` belongs to it, and otherwise begin a new one."""
         before = self.frames.newest
         if self.sample_rate == 0:
             why = ""

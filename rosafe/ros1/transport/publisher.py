@@ -102,8 +102,6 @@ class _Topic(topics._PublisherImpl):
     def __init__(self, name: str, data_class: Any) -> None:
         super().__init__(name, data_class)
         self.on_connection: Callable[[], None] = lambda: None  # called for each new subscriber
-        # Called when subscribers have changed, before a new one gets the latched message; locks of rospy are held.
-        self.on_subscribers_changed: Callable[[], None] = lambda: None
         self.connection_poll.poller.close()
         self.connection_poll = _Poller()
 
@@ -127,7 +125,6 @@ class _Topic(topics._PublisherImpl):
                 raise
             return False
         finally:
-            self.on_subscribers_changed()
             self.on_connection()
             if self.closed:  # meanwhile; rospy would leave the subscriber waiting
                 sender.end()
@@ -135,7 +132,6 @@ class _Topic(topics._PublisherImpl):
     def remove_connection(self, connection: Any) -> None:
         """Remove a subscriber; rospy's method also notifies listeners, which are not used, and fails at shutdown."""
         topics._TopicImpl.remove_connection(self, connection)
-        self.on_subscribers_changed()
 
     def publish(self, message: Any, connection_override: Any = None) -> None:
         """Keep `message` for later subscribers, and send it to the present ones (or to one connection)."""
@@ -143,8 +139,6 @@ class _Topic(topics._PublisherImpl):
             if rospy.is_shutdown():
                 return
             raise rospy.ROSException(f"publish() to {self.resolved_name}, which is closed")
-        if connection_override is not None:  # the latched message, to a new subscriber
-            self.on_subscribers_changed()
         if isinstance(message, NewestMessage):
             message = message.build()
         self.latch = message
@@ -192,7 +186,7 @@ class _Sender:
         self._connection = connection
         self._message_queued = threading.Condition()
         self._queue: deque[BufferList] = deque(maxlen=MAX_QUEUED)
-        self._rest = b""  # of a partially sent message
+        self._rest = b""  # the rest of a partially sent message
         self._sending = False
         threading.Thread(target=self._run, name=f"to {connection.endpoint_id}", daemon=True).start()
 

@@ -9,7 +9,7 @@ replaces the following, before `rospy.init_node`; rospy itself is modified nowhe
 
 * ``rosgraph.xmlrpc.ThreadingXMLRPCServer``: a `HandshakeServer` reads requests, and only complete ones are parsed.
 * ``rospy.impl.tcpros_base.TCPServer``: a `HandshakeServer` reads headers. rospy handles topics, this module services.
-* what `received_data` replaces: the data that the node receives from publishers.
+* the functions that `received_data` replaces: they read the data of publishers.
 """
 
 from __future__ import annotations

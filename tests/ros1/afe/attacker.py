@@ -140,7 +140,7 @@ def _address(uri: str) -> tuple[str, int]:
 
 
 def answer(sock: socket.socket) -> bytes:
-    """Return what the node sends until it closes the connection."""
+    """Return all data from the node until it closes the connection."""
     sock.settimeout(PATIENCE)
     data = b""
     with contextlib.suppress(ConnectionError):

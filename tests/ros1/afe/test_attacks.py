@@ -53,7 +53,7 @@ class Misbehaviour(NamedTuple):
     port: str
     data: bytes
     log: str = ""  # pattern of the line in the log
-    answer: bytes = b""  # part of what the node sends
+    answer: bytes = b""  # a part of the data from the node
     flood: bytes = b""
 
 

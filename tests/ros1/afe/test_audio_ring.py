@@ -326,7 +326,7 @@ def test_the_first_message_of_a_new_acquisition_may_still_be_on_its_way() -> Non
     running.stamp = {"sec": int(time.time()) + 60, "nsec": 0}
     feed(running)
     reader = ring.open_reader(4, 60.0, arrives)
-    assert reader is not None and reader.sample_rate == RATE, "of a running acquisition: no wait"
+    assert reader is not None and reader.sample_rate == RATE, "no wait for a running acquisition"
 
 
 def test_a_reader_is_notified_of_each_complete_block_until_it_is_stopped() -> None:
@@ -368,7 +368,7 @@ def test_two_readers_at_a_replacement() -> None:
     new = opened(ring, 5)
     source.index += 6
     feed(source.message())
-    assert ring.behind == 12, "of the slowest reader"
+    assert ring.behind == 12, "the slowest reader counts"
     first, second = old.read(), new.read()
     assert first is not None and list(first[0][0]) == [source.sample(f) for f in (1, 2, 3, 4)]
     assert second is not None and list(second[0][0]) == [source.sample(f) for f in (7, 8, 9, 10, 11)]

@@ -219,7 +219,7 @@ def test_short_blocks_that_nobody_observes(afe: Session) -> None:
     np.testing.assert_array_equal(arrays(signals, "ihc")[0], truth["ihc"][0, :, : 10 * block])
     microphone.play(signal[:, 10 * block : 20 * block])
     with afe.follow("ihc") as messages:
-        wait_for(lambda: messages[-1].lastFrameIndex == 20 * block + 1, what="what had arrived before")
+        wait_for(lambda: messages[-1].lastFrameIndex == 20 * block + 1, what="the blocks that had arrived before")
         microphone.play(signal[:, 20 * block :])
         wait_for(lambda: messages[-1].lastFrameIndex == 30 * block + 1, what="the end")
         assert [m.lastFrameIndex for m in messages][-10:] == [(20 + n) * block + 1 for n in range(1, 11)]
