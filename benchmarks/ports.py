@@ -25,7 +25,7 @@ from report import Report, arguments
 
 from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.ros1.component import generate
-from rosafe.ros1.transport.buffer_list import BufferList
+from rosafe.ros1.transport.publisher import BufferList
 
 SETTLE_SECONDS = 5.0  # after this time windows and buffers are full
 UNSUBSCRIBED_SECONDS = 2.0  # in this time the node ends a connection and drops the messages that wait for it

@@ -42,7 +42,7 @@ _DIFFERENCE = 1.0  # dB; above this difference between the ears, one value does 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
-        "rosafe record [OUT.wav|OUT.bag] [--device NAME | --topic NAME | --socket HOST:PORT]\n"
+        "rosafe record [OUT.wav|OUT.bag] [--device NAME | --topic NAME]\n"
         "                     [--rate HZ] [--seconds S] [--chunk N] [--force] [--quiet]\n"
         "       rosafe record --calibrate SPL [--device NAME] [--seconds S]\n"
         "       rosafe record --list"
@@ -51,9 +51,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--device", metavar="NAME", help="record from this device without ROS; see --list")
     source.add_argument("--topic", metavar="NAME", help=f"topic of the sound (default: {_TOPIC})")
-    source.add_argument(
-        "--socket", type=_address, metavar="HOST:PORT", help="read from DedicatedSocket of a bass; needs --rate"
-    )
     parser.add_argument(
         "--calibrate",
         type=option_types.number(0, 200, "a level in dB SPL, such as 94,"),
@@ -93,13 +90,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  rosafe record speech.bag --seconds 60          # the sound of a running bass\n"
         "  rosafe record --calibrate 94 --device plughw:1,0"
     )
-
-
-def _address(text: str) -> tuple[str, int]:
-    host, _, port = text.rpartition(":")
-    if not (host and port.isascii() and port.isdigit() and 0 < int(port[:6]) < 65536):
-        raise argparse.ArgumentTypeError(f"expected HOST:PORT, such as 127.0.0.1:8081, got {text!r}")
-    return host.strip("[]"), int(port)
 
 
 # --- recording ---------------------------------------------------------------------------------------------------
@@ -146,8 +136,6 @@ def _list() -> int:
 
 def _check(options: argparse.Namespace) -> Path | None:
     """Complete the options and return the path of the output. Raises CommandError, or exits with a usage error."""
-    if options.socket and not options.rate:
-        options.usage_error("--socket needs --rate, because the protocol does not contain the sample rate")
     if "" in (options.device, options.topic):
         options.usage_error("--device and --topic: expected a name, got an empty text")
     if options.calibrate is not None:
@@ -184,11 +172,6 @@ def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Soun
 
             prefer_pypi_packages()
             return open_source(options.device, options.rate, options.chunk, stopping)
-        if options.socket:
-            from rosafe.ros1.bass.recording.socket_source import SocketSource
-
-            host, port = options.socket
-            return SocketSource(host, port, options.rate, stopping)
         from rosafe.ros1.bass.recording.topic_source import TopicSource
         from rosafe.ros1.component.generate import GenerationError
         from rosafe.ros1.component.startup import become_node
@@ -320,9 +303,7 @@ def _open_output(part: AtomicOutput, options: argparse.Namespace, source: SoundS
         return WavFile(descriptor, source.sample_rate)
     # A published stream keeps its frame numbers and its name.
     chunk, newest = getattr(source, "frames_per_chunk", options.chunk), getattr(source, "newest", 0)
-    return BagWriter(
-        descriptor, source.sample_rate, chunk, f"/{_TOPIC}" if options.device or options.socket else source.name, newest
-    )
+    return BagWriter(descriptor, source.sample_rate, chunk, f"/{_TOPIC}" if options.device else source.name, newest)
 
 
 def _summary(recorder: SoundRecorder, name: str, sample_rate: int) -> str:

@@ -12,8 +12,7 @@ import os
 import resource
 import sys
 
-from rosafe.audio.devices.libasound import captured_alsa_errors, load_alsaaudio
-from rosafe.audio.devices.pcmname import checked_name
+from rosafe.audio.devices.libasound import captured_alsa_errors, checked_name, load_alsaaudio
 from rosafe.interface import ComponentError
 from rosafe.ros1.transport.paths import prefer_pypi_packages
 

@@ -8,18 +8,15 @@ import re
 import subprocess
 import threading
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from rosafe.audio.devices import open_source
 from rosafe.audio.devices.alsa import AlsaSource
-from rosafe.audio.devices.pcmname import checked_name
+from rosafe.audio.devices.libasound import checked_name
 from rosafe.interface import ComponentError
 from rosafe.ros1.transport import paths
 from tests.harness import PYTHON, ROOT
@@ -129,25 +126,17 @@ def opener(folder: Path) -> Iterator[Opener]:
         RUN,
         "plug:\"file:'|touch MARK',raw\"",
         "plug:SLAVE='file:FILE=|touch MARK'",
-        "plug:\"tee:null,'|touch MARK',raw\"",
         "plug:{SLAVE=\"file:'|touch MARK',raw\"}",
         "{type file slave.pcm null file MARK}",
         "file:{FILE MARK}",
         "tee:null,MARK,raw",
         "tee:SLAVE=null,FILE=MARK",
-        "tee:null,/tmp/MARK",
         "file:MARK",
-        "file:FILE=MARK,FORMAT=raw",
-        "pcm.file:MARK",
         "alias:MARK",
         "plug:file:MARK",
-        "plug:SLAVE=file:MARK",
         "plug:SLAVE=tee:null,MARK",
-        "plug:plug:file:MARK",
-        "plug:pcm.tee:null,MARK",
         "plug:alias:MARK",
         "speex:SLAVE=file:MARK",
-        "speex:file:MARK",
         "lavrate:SLAVE=file:MARK,RATE=8000",
         "a52:0,file:MARK",
         "writer:MARK",
@@ -155,39 +144,19 @@ def opener(folder: Path) -> Iterator[Opener]:
         "plug:hidden:MARK",
         "any:file",
         "any:shm",
-        "slave:writer:MARK",
         "shm:a,b",
-        "ctl.shm:a,b",
         "oss:MARK",
-        "plug:oss:MARK",
         "foreign:hw",
         "endless:a",
         "hw:$HOME",
-        "hw:@func",
-        "hw:0}",
-        "hw:0|id",
-        "hw:0;id",
-        "hw:0 ",
+        *(f"hw:0{sign}" for sign in "@}|; \\()[]<>&#!~*"),
         " hw:0",
-        "hw:\\060",
-        "hw:(0)",
-        "hw:[0]",
-        "hw:<0>",
-        "hw:0&a",
-        "hw:0#",
-        "hw:0!",
-        "hw:~",
-        "hw:*",
         "hw=0:1",
         "hw,0",
-        "hw\n",
         "hw:0\n",
         "hw:\0",
-        "hw:0\0'",
         "hw:\u0661",  # an Arabic digit
-        "hw:\uff11",  # a full-width character
         "\u0397w:0",
-        "hw:\u2028",
         "../asound.conf",
         "/dev/snd/pcmC0D0c",
         "",
@@ -288,32 +257,3 @@ def test_no_name_of_this_machine_is_harmful(opener: Opener, step: int) -> None:
             if head != "logged" or arguments:
                 result = opener.open(head + arguments)
                 assert not (result.written or result.run), (head + arguments, result)
-
-
-WORDS = st.sampled_from([*HEADS, "MARK", "raw", "0", "1", "SLAVE", "FILE", "CARD", "DEV", "PCM", "SOCKET", "FORMAT"])
-SIGNS = st.sampled_from([*":::==,,.-_'|{}/ $\n", '"', ""])
-NAMES = st.lists(st.tuples(WORDS, SIGNS), min_size=1, max_size=8).map(lambda parts: "".join(map("".join, parts)))
-
-
-def assert_harmless(opener: Opener, name: str) -> None:
-    """No file is opened for writing, no command is run, and the process survives."""
-    if name not in ("logged", "pcm.logged"):
-        result = opener.open(name)
-        assert not (result.written or result.run), result
-
-
-random_names = given(NAMES | st.text("hw:=,.-_aF0\0 '", max_size=30))
-unlimited = partial(settings, suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-@unlimited(max_examples=120)
-@random_names
-def test_no_random_name_is_harmful(opener: Opener, name: str) -> None:
-    assert_harmless(opener, name)
-
-
-@pytest.mark.exploration
-@unlimited(max_examples=2000)
-@random_names
-def test_none_of_many_random_names_is_harmful(opener: Opener, name: str) -> None:
-    assert_harmless(opener, name)

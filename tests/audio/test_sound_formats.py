@@ -1,4 +1,4 @@
-"""Formats of sound files: the whole sound is read, or the file is refused, or a line says what is missing."""
+"""Formats of sound files: the whole sound is read, or the file is refused, or a line names the missing part."""
 
 from __future__ import annotations
 
@@ -245,7 +245,7 @@ def test_truncated_files_are_refused(tmp_path: Path, form: str) -> None:
     ],
 )
 def test_unknown_length_is_that_of_the_file(tmp_path: Path, form: str, name: bytes, size: bytes) -> None:
-    """As of programs that write to a pipe, or that were killed before they could write the length."""
+    """Programs write such files to a pipe, or if they were killed before they could write the length."""
     data = bytearray(write(tmp_path / "a", form, "PCM_16"))
     expected = whole(tmp_path / "a")
     at = data.index(name) + len(name)

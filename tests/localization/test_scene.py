@@ -11,7 +11,7 @@ import soundfile
 
 import rosafe
 from rosafe.audio.devices import open_source
-from rosafe.audio.devices.scene_file import SceneFileSource
+from rosafe.audio.devices.scene import SceneFileSource
 from rosafe.interface import ComponentError
 from rosafe.localization.results import read_yaw
 from rosafe.localization.scene import Course, SceneRenderer, truth_csv

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 from collections.abc import Iterator
@@ -34,7 +33,7 @@ def graph_without_master(tmp_path: Path) -> Iterator[harness.Graph]:
     "only",
     [
         pytest.param((), marks=pytest.mark.soak),  # everything takes minutes
-        ("cycles", "changes", "unpaired_surrogates"),
+        ("cycles", "changes", "clients_of_the_socket", "a_message_of_4_gib"),
     ],
     ids=",".join,
 )
@@ -78,12 +77,6 @@ def test_growth_is_found() -> None:
         soak._uses.append({"node": replace(use, **{name: value})})
         with pytest.raises(AssertionError, match=r"node: growing (memory|threads|files)"):
             soak._check_growth()
-
-
-@pytest.mark.parametrize("minutes", ["-1", "nan", "ten", ""])
-def test_invalid_minutes(minutes: str) -> None:
-    with pytest.raises(argparse.ArgumentTypeError, match="expected a number of minutes"):
-        command._minutes(minutes)
 
 
 def test_help_has_an_example(graph_without_master: harness.Graph) -> None:

@@ -282,11 +282,6 @@ class World:
             peak = int(status["VmHWM"].split()[0]) * 1024
             assert peak < use.memory + PEAK_MEMORY, f"{name}: {peak / 2**20:.0f} MiB at peak, before {use}"
 
-    def refuses(self, device: str) -> None:
-        """Check that bass rejects a device with the named error."""
-        answer = self.graph.call("/bass/Acquire", device=device)
-        assert not answer.genom_success and "::bass::e_device" in answer.genom_exdetail, (device, answer)
-
     def bring_master(self) -> None:
         """Start a master at the address of the one that was killed, and wait until all nodes are registered there."""
         self.master.start(self.graph.env)
@@ -360,15 +355,6 @@ def world(size: Size, home: Path) -> Iterator[World]:
         genpy.Message.longest_sequence = 2**26  # in this process, long messages of the nodes are accepted
         stack.callback(registrar.end)
         yield World(size, graph, master, stack)
-
-
-def recorded(world: World, path: Path) -> int:
-    """Return the number of frames of a recording, and check that they are successive frames of bass."""
-    samples = soundfile.read(path, dtype="int32")[0].T
-    begin = np.flatnonzero((world.sound == samples[:, :1]).all(axis=0))
-    assert len(begin) == 1, f"{path} begins with {samples[:, :1]}"
-    np.testing.assert_array_equal(samples, world.frames(int(begin[0]) + 1, samples.shape[1]))
-    return int(samples.shape[1])
 
 
 def later(seconds: float) -> Callable[[], bool]:

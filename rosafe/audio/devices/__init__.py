@@ -68,15 +68,12 @@ def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: 
 
         return BagSource(device[len("bag:") :], sample_rate, frames_per_chunk, stopping)
     if device.startswith("scene:"):
-        from rosafe.audio.devices.scene import SceneSource
+        from rosafe.audio.devices.scene import SceneFileSource, SceneSource
 
         if device[len("scene:") :].partition("?")[0]:
-            from rosafe.audio.devices.scene_file import SceneFileSource
-
             return SceneFileSource(device[len("scene:") :], sample_rate, frames_per_chunk, stopping)
         return SceneSource(device[len("scene:") :], sample_rate or DEFAULT_RATE, frames_per_chunk, stopping)
-    from rosafe.audio.devices.alsa import AlsaSource
-    from rosafe.audio.devices.pcm import DeviceBusyError
+    from rosafe.audio.devices.alsa import AlsaSource, DeviceBusyError
 
     try:
         return AlsaSource(device, sample_rate or DEFAULT_RATE, frames_per_chunk, stopping)

@@ -1,12 +1,14 @@
-"""The source `scene:`: a built-in binaural scene, a talker that moves from far left to far right and back.
+"""The sources `scene:`, a talker that moves from far left to far right and back, and `scene:FILE.yaml`.
 
-The head is the rigid sphere of rosafe/localization/sphere.py.
+The head of the built-in scene is the rigid sphere of rosafe/localization/sphere.py.
 """
 
 from __future__ import annotations
 
 import itertools
+import re
 import threading
+from collections.abc import Iterator
 
 import numpy as np
 from scipy import signal
@@ -14,7 +16,8 @@ from scipy import signal
 from rosafe.audio.devices.base import PacedSource, device_error, hwparams_error, parse_options
 from rosafe.audio.files.audiofile import to_int32
 from rosafe.localization.filters import HOP, SourceRenderer
-from rosafe.localization.scene import BLOCK, Truth
+from rosafe.localization.scene import BLOCK, SceneRenderer, Truth
+from rosafe.localization.scene_file import SUFFIXES, SampleRateError, SceneError, read_scene
 from rosafe.localization.sphere import sphere_filters
 from rosafe.system.option_types import number, seconds, whole_number
 
@@ -23,6 +26,8 @@ LEVEL_DB = -30.0
 MIN_RATE = 1000  # Hz; almost no sound would remain below
 _PITCH = (125.0, 25.0, 0.37)  # Hz: mean, excursion and speed of the talker's gliding voice
 _SYLLABLE = 0.25  # s
+# Values of the file in a message: remote clients can name files, whose contents they must not receive.
+_QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""")
 
 
 class Scene:
@@ -144,3 +149,47 @@ class _Carrier:
         count = self._harmonics
         kernel = np.where(np.abs(low) < 1e-9, 2.0 * count + 1.0, np.sin((2 * count + 1) * half) / safe)
         return (kernel - 1.0) / np.sqrt(2.0 * count)
+
+
+class SceneFileSource(PacedSource):
+    """A scene from a file (docs/scenes.md).
+
+    Parameters
+    ----------
+    path : str
+        A YAML file; relative to the folder of the process.
+    sample_rate : int
+        Hz; must be that of the scene, or 0.
+    frames_per_chunk : int
+        The last chunk is filled with zeros.
+
+    Attributes
+    ----------
+    scene : rosafe.localization.scene.SceneDescription
+        The scene.
+    """
+
+    def __init__(self, path: str, sample_rate: int, frames_per_chunk: int, stopping: threading.Event) -> None:
+        super().__init__(f"scene:{path}", stopping)
+        if not path.lower().endswith(SUFFIXES):
+            raise device_error(f"{self.name}: expected a file that ends in .yaml, or options after a question mark")
+        try:
+            self.scene = read_scene(path, sample_rate)
+        except SampleRateError as problem:
+            raise hwparams_error(str(problem)) from None
+        except SceneError as problem:
+            raise device_error(_QUOTED.sub("...", str(problem))) from None
+        duration, rate = self.scene.duration, self.scene.sample_rate
+        self.frames = None if duration is None else max(1, round(duration * rate))  # None without an end
+        self._start(rate, frames_per_chunk, self._rendered(frames_per_chunk))
+
+    def _rendered(self, frames_per_chunk: int) -> Iterator[tuple[int, np.ndarray]]:
+        renderer, position = SceneRenderer(self.scene), 0
+        while self.frames is None or position < self.frames:
+            count = frames_per_chunk if self.frames is None else min(frames_per_chunk, self.frames - position)
+            yield 0, to_int32(renderer.frames(count))
+            position += count
+
+    def truth(self, time: float) -> Truth:
+        """Return the true directions at a time in s from the first frame."""
+        return self.scene.truth(time)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -68,46 +67,3 @@ class OutputPort:
     def has_subscribers(self) -> bool:
         """Whether the topic has subscribers."""
         return self._publisher.has_subscribers
-
-
-class OutputPorts:
-    """The ports of all processors of a tree. Safe from any thread."""
-
-    def __init__(self) -> None:
-        self._by_processor: dict[Processor, OutputPort] = {}
-        self._subscribed: tuple[Processor, ...] | None = None  # None if it may have changed
-        self._lock = threading.Lock()
-
-    def __getitem__(self, processor: Processor) -> OutputPort:
-        return self._by_processor[processor]
-
-    def add(self, processor: Processor, port: OutputPort) -> None:
-        """Add the port of a processor."""
-        self._by_processor[processor] = port
-        self.forget_subscribed()
-
-    def remove(self, processor: Processor) -> OutputPort | None:
-        """Remove and return the port of a processor, if it has one."""
-        port = self._by_processor.pop(processor, None)
-        self.forget_subscribed()
-        return port
-
-    def forget_subscribed(self) -> None:
-        """Look for subscribers again. To be called after each change of the subscribers of a port."""
-        with self._lock:
-            self._subscribed = None
-
-    @property
-    def subscribed(self) -> tuple[Processor, ...]:
-        """The processors whose ports have subscribers."""
-        known = self._subscribed
-        if known is None:
-            with self._lock:
-                ports = tuple(self._by_processor.items())
-                known = self._subscribed = tuple(one for one, port in ports if port.has_subscribers)
-        return known
-
-    @property
-    def observed(self) -> bool:
-        """Whether the tree has observers, which are to see each block."""
-        return any(processor.observers for processor in tuple(self._by_processor)[:1])

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError
-from rosafe.ros1.afe.ports import OutputPort, OutputPorts
+from rosafe.ros1.afe.ports import OutputPort
 from rosafe.ros1.afe.processor_health import ChoiceFallbacks, ProcessorHealth
 from rosafe.ros1.component import serialization
 from rosafe.ros1.component.activities import Activity
@@ -53,7 +53,7 @@ class PublishedTree:
         self._choices = choices
         self._captured = captured
         self._catch_up = catch_up
-        self._ports = OutputPorts()
+        self._ports: dict[Processor, OutputPort] = {}
         self._activities: dict[Processor, Activity] = {}
         self._input_port = self._advertise("input")
         self._time_class = serialization.message_class("rosAFE", "::rosAFE::frameTime")
@@ -87,9 +87,9 @@ class PublishedTree:
 
         It is infinite if no port has subscribers, and 0 if each block is needed.
         """
-        if self._ports.observed:
+        if any(processor.observers for processor in tuple(self._ports)[:1]):  # observers are to see each block
             return 0
-        subscribed = self._ports.subscribed
+        subscribed = [processor for processor, port in tuple(self._ports.items()) if port.has_subscribers]
         if not subscribed:
             return 0 if self._frame_time.has_subscribers else math.inf
         released = [processor.last_block for processor in subscribed]
@@ -106,7 +106,7 @@ class PublishedTree:
         else:
             publisher = self._advertise(processor.kind, processor.name)
             port = OutputPort(processor, publisher, publisher.unregister)
-        self._ports.add(processor, port)
+        self._ports[processor] = port
         self.health.added(processor, self._meters[processor.kind])
         port.publish()
 
@@ -130,7 +130,7 @@ class PublishedTree:
     def on_removed(self, processor: Processor) -> None:
         """Close the port and end the activity."""
         self.health.ended(processor)
-        port = self._ports.remove(processor)
+        port = self._ports.pop(processor, None)
         if port is not None:  # otherwise it could not be opened
             port.close()
         activity = self._activities.get(processor)
@@ -141,5 +141,4 @@ class PublishedTree:
         message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
         publisher = self._node.advertise(KINDS[kind].port, message_class, name)
         publisher.impl.on_connection = self._catch_up
-        publisher.impl.on_subscribers_changed = self._ports.forget_subscribed
         return publisher

@@ -13,8 +13,7 @@ import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.audio.devices import SoundSource, device_lines, open_source
-from rosafe.audio.devices.alsa import AlsaSource
-from rosafe.audio.devices.pcm import DeviceBusyError
+from rosafe.audio.devices.alsa import AlsaSource, DeviceBusyError
 from rosafe.interface import BASS, ComponentError
 from rosafe.ros1.bass.capture import Capture, Snapshot, check_window
 from rosafe.ros1.bass.scene_truth import TruthPublisher, TruthSource

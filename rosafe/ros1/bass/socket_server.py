@@ -7,9 +7,9 @@ on that were no longer available), int64 next nfr, n int32 of the left ear, n in
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import re
-import selectors
 import socket
 import struct
 import threading
@@ -24,6 +24,7 @@ MAX_CLIENTS = 31
 QUIET_SECONDS = 0.05  # without further bytes, until a request without a line end counts as complete
 DEAD_SECONDS = 10.0  # without accepting a byte of an answer, until a client is disconnected
 IDLE_SECONDS = 10.0  # without a complete request, until a client can be disconnected in favour of a new one
+POLL_SECONDS = 0.05  # maximum, so that a stop is noticed
 PAUSE_SECONDS = 0.5  # in accepting connections when the process has no file descriptor left
 _MAX_REQUEST = 4096  # bytes that are kept if they contain no complete request
 _MARK = b"Read Port"
@@ -71,17 +72,56 @@ def _parse(text: bytes) -> tuple[int, int] | None:
 
 
 class _Client:
-    def __init__(self, connection: socket.socket) -> None:
-        self.connection = connection
-        self.inbox = bytearray()
-        self.requests: list[tuple[int, int]] = []
-        self.outbox = memoryview(b"")
-        self.pending = False  # whether the inbox may contain a request without a line end
-        self.received = self.sent = self.requested = time.monotonic()  # last bytes in, bytes out, complete request
+    """A connection, and the thread that serves it. It holds at most one answer."""
+
+    def __init__(self, connection: socket.socket, snapshot: Callable[[], Snapshot | None]) -> None:
+        self.requested = time.monotonic()  # time of the last complete request
+        self.answering = False
+        self._connection = connection
+        self._snapshot = snapshot
+        self._thread = threading.Thread(target=self._serve, name="socket client", daemon=True)
+        self._thread.start()
+
+    @property
+    def connected(self) -> bool:
+        """Whether the client is connected."""
+        return self._thread.is_alive()
+
+    def _serve(self) -> None:
+        inbox = bytearray()
+        quiet = True  # whether the inbox contains no request, even without a line end
+        with self._connection as connection, contextlib.suppress(OSError):  # it has disconnected, or reads no answer
+            while True:
+                connection.settimeout(None if quiet else QUIET_SECONDS)
+                try:
+                    data = connection.recv(_MAX_REQUEST)
+                except TimeoutError:
+                    quiet = True
+                else:
+                    if not data:
+                        return
+                    inbox += data
+                    quiet = False
+                for count, first in list(take_requests(inbox, quiet)):
+                    self._answer(count, first)
+
+    def _answer(self, count: int, first: int) -> None:
+        self.requested, self.answering = time.monotonic(), True
+        self._connection.settimeout(DEAD_SECONDS)
+        rest = memoryview(read_frames(self._snapshot(), count, first))
+        while rest:
+            rest = rest[self._connection.send(rest) :]
+        self.answering = False
+
+    def close(self) -> None:
+        """Disconnect."""
+        with contextlib.suppress(OSError):  # it has disconnected
+            self._connection.shutdown(socket.SHUT_RDWR)
+        self._thread.join()
 
 
 class DedicatedSocket:
-    """A server that holds at most one answer per client, so that a slow client needs no more memory than a window.
+    """A server with a thread for each client.
 
     If the maximum number of clients is connected, a client without a request for `IDLE_SECONDS` is replaced by a new
     one.
@@ -106,111 +146,49 @@ class DedicatedSocket:
     ) -> None:
         self._snapshot = snapshot
         self._report = report
-        self._clients: dict[int, _Client] = {}
+        self._clients: list[_Client] = []
         self._listener = socket.create_server((host, port), backlog=MAX_CLIENTS + 1)  # with SO_REUSEADDR
-        self._listener.setblocking(False)
+        self._listener.settimeout(POLL_SECONDS)
         self.address = self._listener.getsockname()
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(self._listener, selectors.EVENT_READ)
-        self._paused: float | None = None  # when accepting was paused
 
     def serve(self, stopping: threading.Event) -> None:
         """Answer clients until a stop; then close all connections."""
-        try:
+        with self._listener:
             while not stopping.is_set():
-                for key, events in self._selector.select(0.01 if self._has_idle_clients() else 0.05):
-                    if key.fileobj is self._listener:
-                        self._accept()
-                    else:
-                        self._handle_client(key.data, events)
-                self._check_idle_clients()
-                self._accept_again()
-        finally:
-            for client in list(self._clients.values()):
-                self._drop(client)
-            self._selector.close()
-            self._listener.close()
+                try:
+                    connection, (address, *_) = self._listener.accept()
+                except OSError as problem:  # no client for `POLL_SECONDS`, or it has disconnected already
+                    if problem.errno in (errno.EMFILE, errno.ENFILE):
+                        self._report(f"DedicatedSocket: pausing new connections: {problem.strerror}")
+                        stopping.wait(PAUSE_SECONDS)
+                else:
+                    self._add(connection, address)
+                self._clients = [client for client in self._clients if client.connected]
+        for client in self._clients:
+            client.close()
 
-    def _has_idle_clients(self) -> bool:
-        return any(client.pending for client in self._clients.values())
-
-    def _accept(self) -> None:
-        try:
-            connection, (address, *_) = self._listener.accept()
-        except OSError as problem:
-            if problem.errno in (errno.EMFILE, errno.ENFILE):
-                self._report(f"DedicatedSocket: pausing new connections: {problem.strerror}")
-                self._selector.unregister(self._listener)  # it would be ready all the time
-                self._paused = time.monotonic()
-            return  # with another error, the client has disconnected already
+    def _add(self, connection: socket.socket, address: str) -> None:
+        self._clients = [client for client in self._clients if client.connected]
         if len(self._clients) >= MAX_CLIENTS and not self._drop_idle_client():
             self._report(f"DedicatedSocket: {address} rejected: the limit of {MAX_CLIENTS} clients is reached")
             connection.close()
             return
-        connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         keep_alive(connection, idle=60, interval=10, count=6)
-        client = _Client(connection)
-        self._clients[connection.fileno()] = client
-        self._selector.register(connection, selectors.EVENT_READ, client)
-
-    def _accept_again(self) -> None:
-        if self._paused is not None and time.monotonic() - self._paused > PAUSE_SECONDS:
-            self._selector.register(self._listener, selectors.EVENT_READ)
-            self._paused = None
+        try:
+            self._clients.append(_Client(connection, self._snapshot))
+        except RuntimeError as problem:  # no thread is available
+            self._report(f"DedicatedSocket: {address} rejected: {problem}")
+            connection.close()
 
     def _drop_idle_client(self) -> bool:
         """Disconnect the client that has been idle longest, preferably one without a pending answer, if any is idle."""
         now = time.monotonic()
-        idle = [client for client in self._clients.values() if now - client.requested > IDLE_SECONDS]
+        idle = [client for client in self._clients if now - client.requested > IDLE_SECONDS]
         if not idle:
             return False
-        longest = min(idle, key=lambda client: (bool(client.outbox), client.requested))
+        longest = min(idle, key=lambda client: (client.answering, client.requested))
         self._report(f"DedicatedSocket: disconnecting a client without a request for {now - longest.requested:.0f} s")
-        self._drop(longest)
+        longest.close()
+        self._clients.remove(longest)
         return True
-
-    def _drop(self, client: _Client) -> None:
-        del self._clients[client.connection.fileno()]
-        self._selector.unregister(client.connection)
-        client.connection.close()
-
-    def _handle_client(self, client: _Client, events: int) -> None:
-        try:
-            if events & selectors.EVENT_READ:
-                data = client.connection.recv(_MAX_REQUEST)
-                if not data:
-                    return self._drop(client)
-                client.received = time.monotonic()
-                client.inbox += data
-                client.requests += take_requests(client.inbox, quiet=False)
-                client.pending = bool(client.inbox)
-            self._send(client)
-        except OSError:  # reset by the client
-            self._drop(client)
-
-    def _send(self, client: _Client) -> None:
-        while client.requests or client.outbox:
-            if not client.outbox:
-                client.outbox = memoryview(read_frames(self._snapshot(), *client.requests.pop(0)))
-                client.sent = client.requested = time.monotonic()
-            try:
-                sent = client.connection.send(client.outbox)
-            except BlockingIOError:
-                break
-            client.outbox = client.outbox[sent:]
-            client.sent = time.monotonic()
-        # Nothing is read while an answer is being sent; further requests wait in the kernel.
-        events = selectors.EVENT_WRITE if client.outbox else selectors.EVENT_READ
-        self._selector.modify(client.connection, events, client)
-
-    def _check_idle_clients(self) -> None:
-        """Answer requests without a line end, and disconnect clients that do not accept their answers."""
-        now = time.monotonic()
-        for client in list(self._clients.values()):
-            if client.outbox and now - client.sent > DEAD_SECONDS:
-                self._drop(client)
-            elif client.pending and not client.outbox and now - client.received > QUIET_SECONDS:
-                client.pending = False
-                client.requests += take_requests(client.inbox, quiet=True)
-                self._handle_client(client, 0)

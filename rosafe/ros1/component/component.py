@@ -21,15 +21,13 @@ import rospy
 from rosafe import interface
 from rosafe.declarations.text import short_repr
 from rosafe.interface import ComponentError
-from rosafe.ros1.component.action_server import StatusPublisher
+from rosafe.ros1.component.action_server import GoalHandler, StatusPublisher
 from rosafe.ros1.component.activities import Activities, Activity, Handler, TaskStatistics, unexpected_error
 from rosafe.ros1.component.explicit_defaults import has_explicit_defaults, warning_exdetail
-from rosafe.ros1.component.goal_handler import GoalHandler
 from rosafe.ros1.component.request_dispatcher import STOP_WAIT, RequestDispatcher, Values, report_error
 from rosafe.ros1.component.state_publisher import Diagnostics, StatePublisher
 from rosafe.ros1.transport import master, registration
 from rosafe.ros1.transport.publisher import Publisher
-from rosafe.ros1.transport.self_check import SelfCheck
 
 UP_SECONDS = 10.0  # to register a node that starts at the master
 SEND_SECONDS = 0.1  # for responses and results: rospy sends them on its own threads, and does not report when
@@ -53,8 +51,6 @@ class ComponentNode:
         self.activities = Activities(component.tasks, self._state_changed, _log_crash)
         self.meters = {task: TaskStatistics(task) for task in component.tasks}
         self.diagnostics = Diagnostics(self.finished)
-        self._self_check = SelfCheck(self.finished)
-        self.diagnostics.add("calls", self._self_check.health)
         self._state = StatePublisher(component, self.activities, self.meters, self.finished)
         self._dispatcher = RequestDispatcher(component, self.activities, self.finished, bad_value)
         self._registrar = registration.registrar()
@@ -128,7 +124,6 @@ class ComponentNode:
         for task in (functools.partial(self._state.run, state), self.diagnostics.run, self._statuses.run):
             threading.Thread(target=task, daemon=True).start()
         self._registrar.settle(UP_SECONDS)
-        self._self_check.start()
 
     def shutdown(self, by: str) -> None:
         """End all activities and wait for them for a limited time; `by` is named in their exceptions."""

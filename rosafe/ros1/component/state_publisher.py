@@ -18,6 +18,7 @@ import rospy
 from rosafe import interface
 from rosafe.ros1.component import malloc_tuning
 from rosafe.ros1.component.activities import Activities, TaskStatistics
+from rosafe.ros1.transport import systemd
 from rosafe.system.version import VERSION
 
 STATE_PERIOD = 0.9  # s between two genom_state messages at most; the contract is 1
@@ -115,11 +116,12 @@ class Diagnostics(diagnostic_updater.Updater):
         self._changed.set()
 
     def run(self) -> None:
-        """Publish periodically, and after each change, until the node ends."""
+        """Publish periodically and after each change, and notify systemd's watchdog, until the node ends."""
         rounds = itertools.count(1)
         while not self._finished.wait(DIAGNOSTICS_PAUSE):
             self._changed.wait(DIAGNOSTICS_PERIOD - DIAGNOSTICS_PAUSE)
             self._changed.clear()
+            systemd.notify("WATCHDOG=1")
             self.force_update()  # `update` asks the master for the period, and fails without a master
             if next(rounds) % TRIM_ROUNDS == 0:
                 malloc_tuning.trim()

@@ -26,7 +26,6 @@ from rosafe.ros1.localizer.settings import LocalizerSettings, read_settings
 from rosafe.ros1.localizer.status import OK, NodeStatus
 from rosafe.ros1.localizer.tree_link import TreeLink
 from rosafe.ros1.transport import registration
-from rosafe.ros1.transport.self_check import SelfCheck
 from rosafe.system.terminal import printable
 
 UP_SECONDS = 10.0  # to register a node that starts at the master
@@ -58,9 +57,7 @@ class LocalizerNode:
         except ValueError as problem:
             raise ComponentError("::localizer::e_badNewValue", str(problem)) from None
         self._status.value("head", settings.head)
-        self._self_check = SelfCheck(self.finished)
         self._diagnostics.add("localization", self._status.report)
-        self._diagnostics.add("calls", self._self_check.health)
         self._models.report = self._report_learning
         afe = rospy.resolve_name(settings.rosafe)
         self._rotation = _head_rotation(settings, self._status)
@@ -78,7 +75,6 @@ class LocalizerNode:
             afe, settings.connect, self._models.model_for, self._loop.connect, self._status, self._loop.is_stalled
         )
         registration.registrar().settle(UP_SECONDS)
-        self._self_check.start()
         self._loop.start()
         self._link.start()
         threading.Thread(target=self._diagnostics.run, name="diagnostics", daemon=True).start()

@@ -21,8 +21,6 @@ import rospy
 from rospy import topics
 from rospy.impl.registration import Registration, get_topic_manager
 
-from rosafe.ros1.transport.buffer_list import BufferList
-
 # Limits of one subscriber's queue. Windows overlap: the next message of a long port replaces a lost one, and the newest
 # one suffices. Messages of short ports are small, and several can be queued.
 MAX_QUEUED = 32
@@ -30,6 +28,21 @@ MAX_QUEUED_BYTES = 16_000_000
 DIRECT_BYTES = 2**16  # a message up to this length is sent directly, without the thread, if the system accepts it
 _LENGTH = struct.Struct("<I")
 _MAX_PIECES = os.sysconf("SC_IOV_MAX")  # of one sendmsg
+
+
+class BufferList:
+    """A serialized message as buffers for one `sendmsg`. The buffers are not copied and must not change."""
+
+    def __init__(self) -> None:
+        self.pieces: list[Any] = []
+        self.size = 0  # bytes
+
+    def write(self, data: Any, /) -> None:
+        """Append the bytes of a contiguous buffer."""
+        size = len(data) if isinstance(data, (bytes, bytearray)) else data.nbytes
+        if size:
+            self.pieces.append(data)
+            self.size += size
 
 
 class Publisher(rospy.Publisher):
@@ -89,8 +102,6 @@ class _Topic(topics._PublisherImpl):
     def __init__(self, name: str, data_class: Any) -> None:
         super().__init__(name, data_class)
         self.on_connection: Callable[[], None] = lambda: None  # called for each new subscriber
-        # Called when subscribers have changed, before a new one gets the latched message; locks of rospy are held.
-        self.on_subscribers_changed: Callable[[], None] = lambda: None
         self.connection_poll.poller.close()
         self.connection_poll = _Poller()
 
@@ -114,7 +125,6 @@ class _Topic(topics._PublisherImpl):
                 raise
             return False
         finally:
-            self.on_subscribers_changed()
             self.on_connection()
             if self.closed:  # meanwhile; rospy would leave the subscriber waiting
                 sender.end()
@@ -122,7 +132,6 @@ class _Topic(topics._PublisherImpl):
     def remove_connection(self, connection: Any) -> None:
         """Remove a subscriber; rospy's method also notifies listeners, which are not used, and fails at shutdown."""
         topics._TopicImpl.remove_connection(self, connection)
-        self.on_subscribers_changed()
 
     def publish(self, message: Any, connection_override: Any = None) -> None:
         """Keep `message` for later subscribers, and send it to the present ones (or to one connection)."""
@@ -130,8 +139,6 @@ class _Topic(topics._PublisherImpl):
             if rospy.is_shutdown():
                 return
             raise rospy.ROSException(f"publish() to {self.resolved_name}, which is closed")
-        if connection_override is not None:  # the latched message, to a new subscriber
-            self.on_subscribers_changed()
         if isinstance(message, NewestMessage):
             message = message.build()
         self.latch = message
@@ -179,7 +186,7 @@ class _Sender:
         self._connection = connection
         self._message_queued = threading.Condition()
         self._queue: deque[BufferList] = deque(maxlen=MAX_QUEUED)
-        self._rest = b""  # of a partially sent message
+        self._rest = b""  # the rest of a partially sent message
         self._sending = False
         threading.Thread(target=self._run, name=f"to {connection.endpoint_id}", daemon=True).start()
 

@@ -30,7 +30,6 @@ from rospy.impl.registration import (
 )
 
 from rosafe.ros1.transport import master, paths, server_limits
-from rosafe.ros1.transport.connector import Connector
 from rosafe.ros1.transport.succession import MasterProxy, NodeApiHandler, Succession
 from rosafe.system.output import lock_file
 
@@ -291,7 +290,6 @@ def init_node(name: str, argv: list[str], anonymous: bool = False, unless_taken:
             manager = next((one for one in listeners.listeners if isinstance(one, RegManager)), None)
             if manager is None:  # rospy removes it when the node ends
                 raise rospy.ROSInitException("it was asked to end")
-            Connector(manager)
             _registrar = Registrar(manager)
             listeners.listeners[:] = [_registrar]
     except master.FAILURES as problem:

@@ -94,10 +94,6 @@ class Target:
         return len(os.listdir(proc(self.process.pid, "fd")))
 
     @property
-    def threads(self) -> int:
-        return len(os.listdir(proc(self.process.pid, "task")))
-
-    @property
     def megabytes(self) -> float:
         return int(proc(self.process.pid, "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
@@ -143,17 +139,14 @@ def _address(uri: str) -> tuple[str, int]:
     return parts.hostname, parts.port
 
 
-def closed(sock: socket.socket) -> bool:
-    """Wait for the node to close a connection. Return whether it has."""
+def answer(sock: socket.socket) -> bytes:
+    """Return all data from the node until it closes the connection."""
     sock.settimeout(PATIENCE)
-    try:
-        while sock.recv(65536):
-            continue
-    except TimeoutError:
-        return False
-    except ConnectionError:
-        return True
-    return True
+    data = b""
+    with contextlib.suppress(ConnectionError):
+        while part := sock.recv(65536):
+            data += part
+    return data
 
 
 def flood(sock: socket.socket, data: bytes, most: int = 200_000_000) -> int:

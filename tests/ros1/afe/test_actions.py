@@ -74,12 +74,6 @@ def test_failures_are_results(afe: Session) -> None:
     afe.wait_activities(["InputProc", "PreProc"])
 
 
-def test_an_input_without_audio_fails(afe: Session) -> None:
-    silent = silent_port(afe)
-    assert failed(afe.goal("InputProc")) == ("::rosAFE::e_noData", {})
-    silent.unregister()
-
-
 def waiting_input(afe: Session) -> Goal:
     """Start an InputProc that waits for audio."""
     goal = afe.goal("InputProc")
@@ -114,25 +108,6 @@ def test_a_waiting_input_is_interrupted(afe: Session, by: str) -> None:
         assert afe.processors() == {"input": ["newer"]}
     assert failed(goal) == ("::genom::interrupted", {"by": by})
     silent.unregister()
-
-
-def test_many_goals_of_one_kind_at_once(afe: Session) -> None:
-    build(afe, "PreProc", "GammatoneProc", "IhcProc")
-    names = [f"ild{number}" for number in range(8)]  # the queue of actionlib's client has ten entries
-    goals = [afe.goal("IldProc", name=name) for name in names]
-    for goal in goals:
-        goal.active()
-    assert afe.processors()["ild"] == names
-    ids = afe.wait_activities(["InputProc", "PreProc", "GammatoneProc", "IhcProc"] + ["IldProc"] * 8)
-    assert len(ids) == 12
-    goals[5].handle.cancel()
-    succeeded(goals[5])
-    wait_for(lambda: "ild5" not in afe.processors()["ild"])
-    assert all(goal.running for number, goal in enumerate(goals) if number != 5)
-    afe.ok("Stop")
-    for number, goal in enumerate(goals):
-        if number != 5:
-            succeeded(goal)
 
 
 def test_cancel_is_a_normal_end_also_of_the_descendants(afe: Session) -> None:
@@ -177,20 +152,6 @@ def test_abort_activity_ends_goals_and_services_alike(afe: Session) -> None:
     assert afe.refused("abort_activity", activity=ids["GammatoneProc"]) == ("::genom::no_such_activity", {})
     afe.ok("abort_activity", activity=ids["PreProc"])
     succeeded(goals["PreProc"])
-
-
-def test_a_new_input_ends_the_old_one(afe: Session) -> None:
-    goals = build(afe, "PreProc")
-    second = afe.goal("InputProc", name="second").active()
-    succeeded(goals["InputProc"])
-    assert second.running and goals["PreProc"].running
-    assert afe.processors() == {"input": ["second"], "preProc": ["preProc"]}
-
-
-def test_a_new_input_that_fails_leaves_the_old_one(afe: Session) -> None:
-    goals = build(afe, "PreProc")
-    assert failed(afe.goal("InputProc", name="preProc"))[0] == "::rosAFE::e_existsAlready"
-    assert goals["InputProc"].running
 
 
 def test_kill_ends_all_activities_and_the_node(graph: Graph) -> None:

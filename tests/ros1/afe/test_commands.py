@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import signal
 from collections.abc import Iterator
 
 import pytest
@@ -41,20 +40,6 @@ def call(graph: Graph, service: str, values: str) -> str:
     output = graph.run("rosservice", "call", service, values).stdout
     assert "genom_success: True" in output, output
     return output
-
-
-def follow(graph: Graph, pattern: str, *command: str) -> str:
-    """Return the first line of an endless command that matches `pattern`, and interrupt it as with Ctrl-C."""
-    with graph.start(*command, PYTHONUNBUFFERED="1") as process:
-
-        def found() -> re.Match[str] | None:
-            return re.search(pattern, process.out)
-
-        wait_for(found, what=lambda: str(process))
-        process.stop(signal.SIGINT)
-        line = found()
-    assert line is not None
-    return line[0]
 
 
 def test_rosservice_list_type_info_find_args(session: Graph) -> None:
@@ -105,20 +90,6 @@ def test_rostopic_echo(session: Graph) -> None:
     assert whole.count(",") == 99
 
 
-@pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.exploration)])
-def test_rostopic_hz_and_bw(session: Graph, every: int) -> None:
-    """With ten blocks per second, hz reports about this rate, and bw complete messages."""
-    topics = list(PORTS)[::every]
-
-    def watch(index: int) -> tuple[str, str]:
-        return topics[index], follow(session, r"average rate: [\d.]+", "rostopic", "hz", "-w", "20", topics[index])
-
-    for topic, line in run_together(len(topics), watch):
-        assert 2 < float(line.split()[-1]) < 50, topic
-    bandwidth = follow(session, r"average: [\d.]+[KM]?B/s", "rostopic", "bw", "/rosAFE/gammatonePort/gammatone")
-    assert bandwidth.endswith("MB/s")
-
-
 def test_rosnode(session: Graph) -> None:
     assert {"/rosAFE", "/bass"} <= set(session.run("rosnode", "list").stdout.split())
     information = session.run("rosnode", "info", "/rosAFE").stdout
@@ -153,18 +124,3 @@ def test_goals_from_the_shell(session: Graph) -> None:
         wait_for(lambda: "/rosAFE/ildPort/from_shell" in session.topics())
         session.run("rostopic", "pub", "-1", "/rosAFE/IldProc/cancel", "actionlib_msgs/GoalID", "{id: shell}")
         wait_for(lambda: "/rosAFE/ildPort/from_shell" not in session.topics())
-
-
-def test_rosnode_kill(graph: Graph) -> None:
-    with graph.node("rosAFE-ros", "-i", "ended") as process:
-        wait_for(lambda: "ready as /ended" in process.err)  # not before the node has started
-        graph.run("rosnode", "kill", "/ended")
-        assert process.wait() == 0
-        assert "Traceback" not in process.err
-        assert "/ended" not in graph.nodes()
-
-
-def test_the_kill_request(graph: Graph) -> None:
-    with graph.node("rosAFE-ros", "-i", "ended") as process:
-        call(graph, "/ended/kill", "{}")
-        assert process.wait() == 0

@@ -6,61 +6,18 @@ import os
 import random
 import signal
 import socket
-import xmlrpc.client
 from contextlib import ExitStack
 from typing import Any
 from urllib.parse import urlsplit
 
-import rosgraph
 import rosservice
 from actionlib_msgs.msg import GoalStatus
 
 from rosafe.interface import CORE_REPRESENTATIONS, MAX_ACTIVITIES
-from tests.harness import Graph, Process, freeze, proc, run_together, wait_for
-from tests.ros1.afe.session import Session, error_of, noise, own_node, reader
+from tests.harness import Graph, freeze, proc, run_together, wait_for
+from tests.ros1.afe.session import Session, error_of, noise, own_node
 
 BLOCK = 2000
-
-
-def reads(process: Process, index: int) -> None:
-    """Wait until a reader has received the message with `index`."""
-    wait_for(lambda: str(index) in process.out.split(), what=lambda: f"{index} in {process.out}")
-
-
-def test_a_subscriber_that_stops_reading_does_not_block_others(afe: Session) -> None:
-    """It stops during messages of 5 MB; the tree, another subscriber and all requests continue; then it is killed."""
-    microphone = afe.build("PreProc", "GammatoneProc", block=BLOCK, fb_nChannels=16)
-    topic = afe.topic("gammatone")
-    with reader(afe.graph, topic) as stuck, reader(afe.graph, topic) as well:
-        freeze(stuck.pid)
-        for block in range(1, 13):
-            microphone.play(noise(BLOCK))
-            reads(well, block * BLOCK + 1)
-        afe.ok("removeProcessor", name="gammatone")
-        assert topic not in afe.graph.topics()
-        afe.ok("GammatoneProc", fb_nChannels=16)
-        microphone.play(noise(BLOCK))
-        reads(well, 13 * BLOCK + 1)
-        os.kill(stuck.pid, signal.SIGKILL)
-        microphone.play(noise(BLOCK))
-        reads(well, 14 * BLOCK + 1)
-
-
-def test_a_killed_subscriber_is_removed(afe: Session) -> None:
-    microphone = afe.build("PreProc", "GammatoneProc", block=BLOCK, fb_nChannels=16)
-
-    def connections() -> int:
-        """Return the number of TCP connections to this topic according to the node."""
-        node: Any = xmlrpc.client.ServerProxy(rosgraph.Master("/harness").lookupNode("/rosAFE"))
-        return sum(entry[4] == afe.topic("gammatone") for entry in node.getBusInfo("/harness")[2])
-
-    with reader(afe.graph, afe.topic("gammatone")) as process:
-        assert connections() == 1
-        os.kill(process.pid, signal.SIGKILL)
-        for block in range(1, 4):
-            microphone.play(noise(BLOCK))
-            afe.read("preProc", block * BLOCK + 1)
-        wait_for(lambda: connections() == 0)
 
 
 def test_bass_is_killed_and_restarted(graph: Graph) -> None:
@@ -95,30 +52,6 @@ def threads_and_memory(pid: int) -> tuple[int, int]:
 def open_files(pid: int) -> int:
     """Return the number of open files and sockets of a process."""
     return len(list(proc(pid, "fd").iterdir()))
-
-
-def test_cycles_of_creation_and_removal_leak_nothing(afe: Session) -> None:
-    microphone = afe.build("PreProc", block=BLOCK)
-
-    def cycle(number: int) -> None:
-        afe.ok("GammatoneProc", fb_nChannels=2)
-        afe.ok("IhcProc")
-        afe.ok("IldProc", name=f"ild{number}")
-        afe.ok("removeProcessor", name="gammatone")
-
-    for number in range(10):
-        cycle(number)
-    microphone.play(noise(BLOCK))
-    afe.read("preProc", BLOCK + 1)
-    wait_for(lambda: afe.wait_activities(["InputProc", "PreProc"]))
-    threads, memory = threads_and_memory(afe.process.pid)
-    for number in range(30):
-        cycle(number)
-    assert afe.processors() == {"input": ["input"], "preProc": ["preProc"]}
-    wait_for(lambda: threads_and_memory(afe.process.pid)[0] <= threads + 2, what="threads end")
-    assert threads_and_memory(afe.process.pid)[1] < memory + 2**24
-    microphone.play(noise(BLOCK))
-    afe.read("preProc", 2 * BLOCK + 1)
 
 
 def test_random_requests_of_eight_clients(afe: Session) -> None:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
-import urllib.request
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +15,8 @@ from hypothesis import strategies as st
 from rosAFE.msg import rosAFE_frameTime, rosAFE_TimeFrequencySignalPortStruct
 
 from rosafe.ros import FrameClock, array_msg
-from rosafe.ros1.component import serialization
 from rosafe.ros1.component.frame_clock import FrameTime
-from tests.harness import SCRIPTS, Graph, free_port, wait_for
+from tests.harness import Graph, wait_for
 from tests.ros1.afe.session import Microphone, Session, noise
 
 BEGIN = 1_700_000_000.0
@@ -242,52 +238,3 @@ def test_times_that_are_not_valid(
     publish(1000, 44100.0)
     wait_for(lambda: clock.covers(1000, 1))
     assert not clock.problem
-
-
-def test_tcl_and_matlab_read_the_time(afe: Session, stamped: Stamped) -> None:
-    port = free_port()
-    afe.build(block=1000)
-    stamped.play(noise(2000))
-    afe.graph.message("/rosAFE/frameTime", rosAFE_frameTime, lambda m: m.frameIndex == 2000)
-    with afe.graph.start(str(SCRIPTS / "genomixd"), "-p", str(port)):
-
-        def ask(syntax: str) -> bytes:
-            url = f"http://127.0.0.1:{port}/call/rosAFE/frameTime?syntax={syntax}"
-            with urllib.request.urlopen(url) as answer:
-                return bytes(answer.read())
-
-        def answered() -> Any:
-            try:
-                return json.loads(ask("json"))
-            except OSError:
-                return None
-
-        frame_time = wait_for(answered)["frameTime"]
-        assert frame_time == {
-            "stamp": {"sec": 1_700_000_000, "nsec": frame_time["stamp"]["nsec"]},
-            "frameIndex": 2000,
-            "sampleRate": pytest.approx(20_000),
-        }
-        assert frame_time["stamp"]["nsec"] == pytest.approx(1e8, abs=2000)
-        nsec = frame_time["stamp"]["nsec"]
-        rate = frame_time["sampleRate"]
-        text = f"frameTime {{stamp {{sec 1700000000 nsec {nsec}}} frameIndex 2000 sampleRate {rate!r}}}"
-        assert ask("tcl").decode() == text
-        assert b"stamp" in ask("packed")
-
-
-def test_the_array_class_serializes_like_the_generated_one(graph: Graph) -> None:
-    import io
-
-    both = []
-    stamp = {"sec": 7, "nsec": 9}
-    quick = serialization.message_class("rosAFE", "::rosAFE::frameTime")
-    for message in (
-        rosAFE_frameTime(rospy.Time(7, 9), 11, 44100.5),
-        quick(stamp=stamp, frameIndex=11, sampleRate=44100.5),
-    ):
-        out = io.BytesIO()
-        message.serialize(out)
-        both.append(out.getvalue())
-    assert both[0] == both[1]
-    assert quick().deserialize(both[0]).stamp.nsec == 9

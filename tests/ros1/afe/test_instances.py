@@ -35,17 +35,6 @@ def test_two_instances_share_one_source(graph: Graph) -> None:
         right.read("gammatone", 3 * BLOCK + 1)
 
 
-def test_a_second_node_of_a_name_ends_the_first(graph: Graph) -> None:
-    """As in ROS: the new node takes over, the old one ends cleanly."""
-    with own_node(graph, name="twice") as older, graph.start(str(SCRIPTS / "rosAFE-ros"), "-i", "twice") as process:
-        assert older.process.wait() == 0
-        newer = Session(graph, process, "twice")
-        wait_for(lambda: "/twice/kill" in graph.services(), what=lambda: str(process))
-        newer.build("PreProc")
-        assert list(newer.processors()) == ["input", "preProc"]
-        newer.close()
-
-
 def test_remapped_topics(graph: Graph) -> None:
     with own_node(
         graph, "bass/Audio:=/elsewhere/Audio", "/mapped/preProcPort/preProc:=/shown/here", name="mapped"

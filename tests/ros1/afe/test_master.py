@@ -125,4 +125,4 @@ def test_the_end_does_not_wait_for_a_master(private_graph: tuple[Graph, MasterPr
             assert node.stop(signal.SIGTERM) == 0
         finally:
             bring_back()
-        wait_for(lambda: "/rosAFE" not in graph.nodes(), what="the master hears of the end when it can")
+        wait_for(lambda: "/rosAFE" not in graph.nodes(), what="the master receives the end later")

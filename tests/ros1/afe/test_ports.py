@@ -15,7 +15,7 @@ from rosafe.interface import CORE_REPRESENTATIONS, ROSAFE, ros_type
 from rosafe.ros import array_srv
 from rosafe.ros1.component import serialization
 from tests.harness import wait_for
-from tests.ros1.afe.session import RATE, Session, assert_holds, ears, expected, noise, windowed
+from tests.ros1.afe.session import RATE, Session, assert_holds, expected, noise, windowed
 
 CHAIN = ("PreProc", "GammatoneProc", "IhcProc", "IldProc", "RatemapProc", "CrossCorrelationProc")
 FRAMED = ("ild", "ratemap", "crossCorrelation")
@@ -53,23 +53,6 @@ def test_each_port_contains_the_result_of_process(afe: Session, seconds: float) 
                 assert message.numberOfLags == len(truth["cc_lags"]) == message.left.shape[0]
 
 
-def test_the_default_tree_at_44100(afe: Session) -> None:
-    """31 channels, windows of 1 s, and blocks of 12000 frames: the defaults."""
-    rate, blocks = 44100, 2
-    microphone = afe.listen(sample_rate=rate, chunk=2205, chunks=20)
-    for request in ("InputProc", *CHAIN):
-        afe.ok(request)
-    signal = noise(12000 * blocks)
-    microphone.play(signal)
-    truth = expected(signal, 12000, rate=rate)
-    for kind in CORE_REPRESENTATIONS:
-        message = afe.read(kind, 12000 * blocks + 1)
-        frame_rate = truth[f"{kind}_frameRate"] if kind in FRAMED else rate
-        assert message.framesOnPort == frame_rate
-        assert_holds(message, kind, windowed(truth[kind], 1.0, frame_rate))
-    assert afe.read("crossCorrelation").left.shape == (99, 31, 100)
-
-
 def test_each_block_is_published_in_order_and_advances_the_window(afe: Session) -> None:
     microphone = afe.build("PreProc", block=BLOCK, bufferSize_s_port=0.3)
     signal = noise(6 * BLOCK)
@@ -82,14 +65,6 @@ def test_each_block_is_published_in_order_and_advances_the_window(afe: Session) 
         for message in messages:
             end = max(0, message.lastFrameIndex - 1)
             assert_holds(message, "preProc", windowed(signal[:, :end] / (2**31 - 1), 0.3, RATE))
-
-
-def test_a_late_subscriber_gets_the_newest_message(afe: Session) -> None:
-    microphone = afe.build("PreProc", block=BLOCK)
-    microphone.play(noise(3 * BLOCK))
-    afe.read("preProc", 3 * BLOCK + 1)
-    with afe.follow("preProc") as messages:
-        assert [m.lastFrameIndex for m in messages] == [3 * BLOCK + 1]
 
 
 @pytest.mark.parametrize("kind", ["preProc", "ihc", "ild", "crossCorrelation"])
@@ -128,17 +103,6 @@ def test_a_change_of_the_hop_changes_the_port(afe: Session) -> None:
     assert np.all(message.left[:, :50] == 0.0), "and zeros before"
 
 
-def test_a_change_of_channels_changes_the_ports_of_descendants(afe: Session) -> None:
-    microphone = afe.build(*CHAIN[:4], block=BLOCK, fb_nChannels=2)
-    microphone.play(noise(BLOCK))
-    afe.read("ild", BLOCK + 1)
-    afe.ok("modifyParameter", nameProc="gammatone", nameParam="fb_nChannels", newValue="5")
-    microphone.play(noise(BLOCK, 2))
-    for kind in ("gammatone", "ihc", "ild"):
-        message = afe.read(kind, 2 * BLOCK + 1)
-        assert message.numberOfChannels == 5 == message.left.shape[0]
-
-
 def test_the_true_frame_rate_is_rounded(afe: Session) -> None:
     afe.build(*CHAIN[:3], fb_nChannels=2)
     for name, hop in (("fast", 0.003), ("slow", 0.07), ("slower", 1.9)):
@@ -174,17 +138,6 @@ def test_two_of_a_kind_and_names_with_a_slash(afe: Session) -> None:
     message = afe.read("gammatone", BLOCK + 1, name="wide/low")
     assert_holds(message, "gammatone", windowed(truth["gammatone"], 1.0, RATE))
     assert afe.read("gammatone", BLOCK + 1).numberOfChannels == 3
-
-
-def test_a_child_starts_with_the_last_released_block(afe: Session) -> None:
-    microphone = afe.build("PreProc", block=BLOCK)
-    signal = noise(2 * BLOCK)
-    microphone.play(signal)
-    afe.read("preProc", 2 * BLOCK + 1)
-    afe.ok("GammatoneProc", fb_nChannels=2)
-    message = afe.read("gammatone", 2 * BLOCK + 1)
-    truth = expected(signal[:, BLOCK:], BLOCK, {"fb_nChannels": 2})
-    assert_holds(message, "gammatone", windowed(truth["gammatone"], 1.0, RATE))
 
 
 def test_the_data_object_is_advertised_and_silent(afe: Session) -> None:
@@ -266,42 +219,10 @@ def test_short_blocks_that_nobody_observes(afe: Session) -> None:
     np.testing.assert_array_equal(arrays(signals, "ihc")[0], truth["ihc"][0, :, : 10 * block])
     microphone.play(signal[:, 10 * block : 20 * block])
     with afe.follow("ihc") as messages:
-        wait_for(lambda: messages[-1].lastFrameIndex == 20 * block + 1, what="what had arrived before")
+        wait_for(lambda: messages[-1].lastFrameIndex == 20 * block + 1, what="the blocks that had arrived before")
         microphone.play(signal[:, 20 * block :])
         wait_for(lambda: messages[-1].lastFrameIndex == 30 * block + 1, what="the end")
         assert [m.lastFrameIndex for m in messages][-10:] == [(20 + n) * block + 1 for n in range(1, 11)]
-
-
-def test_repeated_calls_get_each_frame_once(afe: Session) -> None:
-    """Called while the tree computes; the joined responses are the result of `rosafe.process`."""
-    parameters = {"fb_nChannels": 2}
-    microphone = afe.build(*CHAIN, block=BLOCK, bufferSize_s_getSignal=2.0, **parameters)
-    blocks = 14
-    signal = noise(blocks * BLOCK)
-    got: dict[str, list[tuple[int, np.ndarray]]] = {kind: [] for kind in CORE_REPRESENTATIONS}
-
-    def call() -> None:
-        signals = afe.ok("getSignals").signals
-        for kind in CORE_REPRESENTATIONS:
-            (message,) = getattr(signals, kind)
-            got[kind].append((message.lastFrameIndex, arrays(signals, kind)[0]))
-
-    while microphone.index < signal.shape[1]:
-        microphone.play(signal[:, microphone.index : microphone.index + 2 * BLOCK - 700])
-        call()
-    for kind in CORE_REPRESENTATIONS:
-        afe.read(kind, blocks * BLOCK + 1)
-    call()
-    truth = expected(signal, BLOCK, parameters)
-    for kind in CORE_REPRESENTATIONS:
-        left, _ = ears(kind, truth[kind])
-        np.testing.assert_array_equal(np.concatenate([piece for _, piece in got[kind]], axis=-1), left)
-        seen = 0
-        for index, piece in got[kind]:
-            seen += piece.shape[-1]
-            assert index in range(BLOCK + 1, blocks * BLOCK + 2, BLOCK) or (index, seen) == (0, 0)
-            if kind not in FRAMED:
-                assert seen == max(0, index - 1), "the index of the frame after the newest one"
 
 
 def test_signals_are_kept_for_the_length_of_the_buffer(afe: Session) -> None:

@@ -18,7 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rospy.exceptions import TransportTerminated
 
 from rosafe.ros1.component import serialization
-from rosafe.ros1.transport import server_limits
+from rosafe.ros1.transport import received_data
 from tests.harness import PATIENCE
 
 AUDIO = "::binaudio::portStruct"
@@ -65,7 +65,7 @@ def received(sock: socket.socket, data_class: Any, count: int, queue_size: int |
         messages: list[Any] = []
         while not messages:
             if buffer.tell() >= 4:
-                server_limits._read_messages(protocol, buffer, messages, sock)
+                received_data.read_messages(protocol, buffer, messages, sock)
             if not messages:
                 part = sock.recv(RECEIVE_BYTES)
                 assert part, "the connection has ended"
@@ -100,12 +100,12 @@ def test_a_publisher_that_disconnects_within_a_message() -> None:
 def test_generated_classes_are_read_by_rospy(monkeypatch: pytest.MonkeyPatch) -> None:
     """They cannot be read from a view of memory, whatever limits a process sets for them."""
     monkeypatch.setattr(genpy.Message, "longest_sequence", 2**26, raising=False)
-    server_limits.max_size.cache_clear()
+    received_data.max_size.cache_clear()
     text = "x" * 10_000
     message = DiagnosticArray(status=[DiagnosticStatus(name=text)])
     with sending(serialized(message), serialized(message)) as sock:
         assert [found.status[0].name for found in received(sock, DiagnosticArray, 2)] == [text, text]
-    server_limits.max_size.cache_clear()
+    received_data.max_size.cache_clear()
 
 
 def test_a_bounded_queue_keeps_the_newest_messages() -> None:

@@ -72,13 +72,6 @@ def test_a_second_input_replaces_the_first_and_keeps_the_tree(afe: Session) -> N
     assert afe.ok("getDependencies", nameProc="preProc").dependencies == ["other", "preProc"]
 
 
-def test_an_input_cannot_take_the_name_of_another_processor(afe: Session) -> None:
-    afe.build("PreProc")
-    before = snapshot(afe)
-    assert afe.refused("InputProc", name="preProc") == ("::rosAFE::e_existsAlready", {})
-    assert snapshot(afe) == before
-
-
 def test_a_rejected_second_input_does_not_affect_the_first(afe: Session) -> None:
     microphone = afe.build(block=800)
     ex, detail = afe.refused("InputProc", bufferSize_s_port=math.nan)
@@ -119,32 +112,18 @@ def test_the_order_of_checks(afe: Session) -> None:
 OUT_OF_RANGE: tuple[tuple[str, dict[str, Any], str], ...] = (
     ("PreProc", {"pp_cutoffHzDC": math.nan}, "pp_cutoffHzDC"),
     ("PreProc", {"pp_bRemoveDC": True, "pp_cutoffHzDC": RATE / 2}, "pp_cutoffHzDC"),
-    ("PreProc", {"pp_intTimeSecRMS": -1.0}, "pp_intTimeSecRMS"),
-    ("PreProc", {"pp_coefPreEmphasis": 1.5}, "pp_coefPreEmphasis"),
-    ("PreProc", {"pp_refSPLdB": math.inf}, "pp_refSPLdB"),
     ("PreProc", {"name": "white space"}, "name"),
-    ("PreProc", {"name": "umlaut_ä"}, "name"),
     ("PreProc", {"name": "a//b"}, "name"),
     ("PreProc", {"name": "x" * 5000}, "name"),
     ("GammatoneProc", {"fb_highFreqHz": float(RATE)}, "fb_highFreqHz"),
     ("GammatoneProc", {"fb_lowFreqHz": 3000.0, "fb_highFreqHz": 2000.0}, "fb_"),
-    ("GammatoneProc", {"fb_nERBs": -1.0}, "fb_nERBs"),
     ("GammatoneProc", {"fb_nERBs": 1e-12}, "fb_nERBs"),
-    ("GammatoneProc", {"fb_nChannels": 2**32 - 1}, "fb_nChannels"),
-    ("GammatoneProc", {"fb_nGamma": 10**6}, "fb_nGamma"),
     ("GammatoneProc", {"fb_cfHz": [100.0, math.nan]}, "fb_cfHz"),
     ("GammatoneProc", {"fb_cfHz": [100.0, RATE * 1.0]}, "fb_cfHz"),
     ("GammatoneProc", {"fb_cfHz": [100.0] * 5000}, "fb_cfHz"),
-    ("IldProc", {"ild_wSizeSec": -0.02}, "ild_wSizeSec"),
     ("IldProc", {"ild_hSizeSec": 1e-9}, "ild_hSizeSec"),
-    ("IldProc", {"ild_hSizeSec": 1e300}, "ild_hSizeSec"),
-    ("RatemapProc", {"rm_decaySec": -math.inf}, "rm_decaySec"),
-    ("RatemapProc", {"rm_wSizeSec": 1e6}, "rm_wSizeSec"),
-    ("CrossCorrelationProc", {"cc_maxDelaySec": -0.001}, "cc_maxDelaySec"),
     ("CrossCorrelationProc", {"cc_maxDelaySec": 9.9, "cc_hSizeSec": 0.0001}, "port or history"),
-    ("InputProc", {"bufferSize_s_port": -1.0}, "bufferSize_s_port"),
     ("InputProc", {"bufferSize_s_port": 1e9}, "bufferSize_s_port"),
-    ("InputProc", {"bufferSize_s_getSignal": math.nan}, "bufferSize_s_getSignal"),
     ("InputProc", {"nFramesPerBlock": 2**32 - 1}, "nFramesPerBlock"),
 )
 
@@ -420,15 +399,6 @@ def test_names_are_resolved_as_in_ros(afe: Session) -> None:
     wait_for(lambda: microphone.subscribed)
 
 
-def test_there_are_no_remote_services(afe: Session) -> None:
-    assert afe.refused("connect_service", local="any", remote="thing") == ("::genom::no_such_remote", {})
-
-
-def test_missing_activities_cannot_be_aborted(afe: Session) -> None:
-    for number in (0, 99999, 2**32 - 1):
-        assert afe.refused("abort_activity", activity=number) == ("::genom::no_such_activity", {})
-
-
 def test_errors_are_valid_json_for_any_name(afe: Session) -> None:
     """Quotes, backslashes, line ends and other alphabets of the request are part of the reason."""
     afe.build("PreProc")
@@ -436,32 +406,6 @@ def test_errors_are_valid_json_for_any_name(afe: Session) -> None:
         response = afe.call("GammatoneProc", name=name)
         body = json.loads(response.genom_exdetail)
         assert body["ex"] == "::rosAFE::e_badNewValue" and repr(name) in body["detail"]["what"]
-
-
-def test_eight_simultaneous_clients(afe: Session) -> None:
-    """Each builds, queries, modifies and removes its own branch; the tree is consistent in the end."""
-    microphone = afe.build("PreProc", block=400)
-
-    def work(number: int) -> None:
-        for _ in range(3):
-            name = f"g{number}"
-            afe.ok("GammatoneProc", name=name, fb_nChannels=2)
-            afe.ok("IhcProc", name=f"i{number}", upperDepName=name)
-            afe.ok("IldProc", name=f"l{number}", upperDepName=f"i{number}")
-            assert afe.ok("getDependencies", nameProc=f"l{number}").dependencies[-3:] == [
-                name,
-                f"i{number}",
-                f"l{number}",
-            ]
-            afe.ok("modifyParameter", nameProc=f"i{number}", nameParam="ihc_method", newValue="halfwave")
-            assert afe.refused("GammatoneProc", name=name)[0] == "::rosAFE::e_existsAlready"
-            afe.ok("getSignals")
-            afe.ok("removeProcessor", name=name)
-
-    harness.run_together(8, work)
-    assert afe.processors() == {"input": ["input"], "preProc": ["preProc"]}
-    microphone.play(noise(400))
-    afe.read("preProc", 401)
 
 
 def test_simultaneous_requests_for_one_name_create_one_processor(afe: Session) -> None:

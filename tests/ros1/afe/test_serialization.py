@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import itertools
-import time
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,8 @@ from rosafe import interface
 from rosafe.interface import ROSAFE
 from rosafe.ros import array_msg
 from rosafe.ros1.component import serialization
-from rosafe.ros1.transport.buffer_list import BufferList
-from rosafe.tree.sliding_window import SlidingWindow, WindowView
+from rosafe.ros1.transport.publisher import BufferList
+from rosafe.tree.sliding_window import SlidingWindow
 
 TIME_DOMAIN = "::rosAFE::TimeDomainSignalPortStruct"
 TIME_FREQUENCY = "::rosAFE::TimeFrequencySignalPortStruct"
@@ -123,19 +122,6 @@ def test_missing_fields_get_the_defaults_of_the_generated_class(fields: dict[str
     assert received.right.shape == (0, 0) and received.sampleRate == fields.get("sampleRate", 0)
     with pytest.raises(AttributeError, match="sampelRate"):
         message_class(sampelRate=1, lastFrameIndex=1, framesOnPort=1, numberOfChannels=1, left=[], right=[])
-
-
-def test_the_pieces_of_a_window_are_sent_as_one() -> None:
-    window = SlidingWindow((2, 3), 7)
-    for size in (4, 2, 3):
-        window.append(np.random.default_rng(size).normal(size=(2, 3, size)))
-    view, array = window.view(), window.view().array()
-    ours, plain = ours_and_plain(TIME_FREQUENCY, *array)
-    ours.left, ours.right = view.select(0), view.select(1)
-    assert serialized(ours) == serialized(plain)
-    ours, plain = ours_and_plain(CROSS_CORRELATION, array.swapaxes(0, 1))
-    ours.left = view.swap_rows()
-    assert serialized(ours) == serialized(plain)
 
 
 @settings(max_examples=60)
@@ -351,24 +337,3 @@ def test_signals_of_the_wrong_shape_are_rejected() -> None:
 
 
 # --- large messages ---------------------------------------------------------------------------------------------
-
-
-def test_a_port_of_22_megabytes(record_property: Any) -> None:
-    """The time is recorded (pytest --junitxml) and not checked, as machines differ."""
-    values = np.random.default_rng(1).normal(size=(2, 31, 44100))
-    pieces = tuple(values[..., start : start + 12000] for start in range(0, 44100, 12000))
-    view = WindowView(pieces)
-    message = serialization.message_class("rosAFE", TIME_FREQUENCY)(
-        **HEADS[TIME_FREQUENCY], left=view.select(0), right=view.select(1)
-    )
-    begun = time.perf_counter()
-    data = serialized(message)
-    written = time.perf_counter()
-    received = serialization.message_class("rosAFE", TIME_FREQUENCY)().deserialize(data)
-    read = time.perf_counter()
-    record_property("serialize_ms", 1000 * (written - begun))
-    record_property("deserialize_ms", 1000 * (read - written))
-    assert len(data) == 24 + 2 * (4 + 31 * (4 + 44100 * 8))
-    np.testing.assert_array_equal(received.left, values[0])
-    np.testing.assert_array_equal(received.right, values[1])
-    assert np.shares_memory(received.left, np.frombuffer(data, np.uint8)), "a view of the received bytes, not a copy"

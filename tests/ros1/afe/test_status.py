@@ -16,7 +16,7 @@ from actionlib_msgs.msg import GoalStatusArray
 import bass.msg
 from rosafe.ros1.component import action_server, generate
 from rosafe.ros1.component.action_server import DEFAULT_FREQUENCY, StatusPublisher
-from rosafe.ros1.transport.buffer_list import BufferList
+from rosafe.ros1.transport.publisher import BufferList
 from tests.harness import PATIENCE, PYTHON, Graph, wait_for
 
 GENERATOR = Path("/usr/lib/gencpp/gen_cpp.py")

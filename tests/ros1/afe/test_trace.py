@@ -138,7 +138,7 @@ def test_a_node_without_processors_and_a_missing_node(afe: Session, tmp_path: Pa
     refused(rosafe("trace", "-o", there, **env), "already exists", "--force")
     refused(rosafe("trace", "-o", tmp_path / "no" / "t.json", **env), "does not exist")
     refused(rosafe("trace", "--seconds", "0.1", "-o", there, "--force", **env), "/rosAFE has no processors")
-    refused(rosafe("trace", "--node", "nobody", **env), "/nobody does not publish a trace")
+    refused(rosafe("trace", "--node", "absent", **env), "/absent does not publish a trace")
     assert there.read_text() == "mine"
     for wrong in ("nan", "1e9"):
         refused(rosafe("trace", f"--seconds={wrong}"), "seconds", code=2)

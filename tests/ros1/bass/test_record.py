@@ -29,12 +29,6 @@ def samples_of(path: Path) -> np.ndarray:
     return np.asarray(soundfile.read(path, dtype="int32")[0].T)
 
 
-def wait_for_sound(path: Path, recording: Process) -> None:
-    """Wait until samples are being written to the file."""
-    part = path.with_name(f"{path.name}.part")
-    wait_for(lambda: part.exists() and part.stat().st_size > 4000, what=lambda: str(recording))
-
-
 def number(pattern: str, text: str) -> float:
     found = re.search(pattern, text)
     assert found, text
@@ -60,17 +54,6 @@ def test_through_a_bag_into_a_wav(wav: Path, tmp_path: Path) -> None:
     done = rosafe("record", "a.wav", "--device", "bag:a.bag", "--seconds", "0.25", cwd=tmp_path)
     assert done.returncode == 0 and done.stderr == "", done
     assert np.array_equal(samples_of(tmp_path / "a.wav"), samples_of(wav))
-
-
-def test_loss_is_reported_with_its_position(tmp_path: Path) -> None:
-    samples = bags.stream(3000)
-    messages = [bags.message(samples, index, 400, RATE, 200) for index in (0, 200, 400, 1600, 2000)]
-    bags.write(tmp_path / "a.bag", messages)
-    done = rosafe("record", "a.wav", "--device", "bag:a.bag", "--chunk", "200", cwd=tmp_path)
-    assert done.returncode == 0, done
-    assert "lost 800 frames (0.100 s) after frame 400 (0.05 s)\n" in done.stdout and "800 frames lost\n" in done.stdout
-    samples[:, 400:1200] = 0
-    assert np.array_equal(samples_of(tmp_path / "a.wav"), samples[:, :2000])
 
 
 def test_levels_without_output(tmp_path: Path) -> None:
@@ -116,28 +99,14 @@ def test_invalid_arguments_change_nothing(wav: Path, tmp_path: Path, capsys: pyt
         direct_result(capsys, *device, "--rate", "-5"), "expected a whole number from 1 to 768000, got '-5'", code=2
     )
     refused(direct_result(capsys, *device, "--topic", "/x"), "not allowed with", code=2)
-    refused(direct_result(capsys, "--socket", "nowhere"), "expected HOST:PORT", code=2)
-    refused(direct_result(capsys, "--socket", "127.0.0.1:9"), "needs --rate", code=2)
     refused(rosafe("record", kept, "--force", "--device", "file:missing.wav"), "missing.wav: No such file")
     refused(rosafe("record", kept, "--force", *device, "--rate", "44100"), "expected 44100 Hz, got 8000 Hz")
-    refused(rosafe("record", "--socket", f"127.0.0.1:{free_port()}", "--rate", "8000"), "Connection refused")
     uri = f"http://127.0.0.1:{free_port()}"
     refused(rosafe("record", ROS_MASTER_URI=uri), f"no ROS master at {uri}", "or record from a --device without ROS")
     assert kept.read_text() == "precious"
     assert sorted(os.listdir(tmp_path)) == ["folder.wav", "kept.wav"]
     done = rosafe("record", kept, "--force", "-q", *device)
     assert done.returncode == 0 and samples_of(kept).shape[1] >= 2000
-
-
-def test_list(tmp_path: Path) -> None:
-    done = rosafe("record", "--list")
-    assert done.returncode == 0
-    assert [line.split()[0] for line in done.stdout.splitlines()][:4] == [
-        "file:PATH",
-        "bag:PATH",
-        "scene:FILE.yaml",
-        "scene:",
-    ]
 
 
 def test_signals_leave_a_complete_file(tmp_path: Path) -> None:
@@ -229,37 +198,6 @@ def test_topic_to_wav_and_bag(graph: Graph, capturing: Process, tmp_path: Path) 
     newest = [int(message.lastFrameIndex) for message in messages]
     at = find(np.stack([messages[-1].left[-400:], messages[-1].right[-400:]]))
     assert newest[-1] == at + 400 and np.all(np.diff(newest) == 400)  # frame indices of the stream
-
-
-def test_dedicated_socket_to_wav(graph: Graph, capturing: Process, tmp_path: Path) -> None:
-    import rospy
-
-    graph.client()
-    port = free_port()
-    rospy.set_param("/recorded/socket_port", port)
-    acquire(graph)
-    assert graph.call("/recorded/DedicatedSocket").genom_success
-    address = ("--socket", f"127.0.0.1:{port}", "--rate", str(RATE))
-    done = rosafe("record", "a.wav", *address, "--seconds", "0.3", cwd=tmp_path)
-    assert done.returncode == 0 and "0 frames lost" in done.stdout, done
-    find(samples_of(tmp_path / "a.wav"))
-    with start("record", "b.wav", *address, "-q", cwd=tmp_path) as recording:
-        wait_for_sound(tmp_path / "b.wav", recording)
-        assert graph.call("/recorded/CloseSocket").genom_success
-        assert recording.wait() == 1
-        assert recording.err == f"rosafe record: 127.0.0.1:{port}: bass has closed the connection\n"
-    find(samples_of(tmp_path / "b.wav"))
-
-
-def test_new_acquisition_ends_the_recording(graph: Graph, capturing: Process, tmp_path: Path) -> None:
-    """Two streams are not joined; the recording of the first one is kept."""
-    acquire(graph)
-    with graph.start(str(ROSAFE), "record", "a.wav", "--topic", "/recorded/Audio", "-q", cwd=tmp_path) as recording:
-        wait_for_sound(tmp_path / "a.wav", recording)
-        acquire(graph)
-        assert recording.wait() == 1
-        assert recording.err.startswith("rosafe record: /recorded/Audio: a new stream begins (its index falls from ")
-    find(samples_of(tmp_path / "a.wav"))
 
 
 def test_topics_without_audio_are_rejected(graph: Graph, capturing: Process, tmp_path: Path) -> None:

@@ -254,9 +254,3 @@ def test_exactly_the_requested_number_of_frames_is_recorded(tmp_path: Path, fram
     assert not ended and recorder.frames == frames
     left = soundfile.read(tmp_path / "a.wav", dtype="int32")[0][:, 0]
     assert left.tolist() == ([1] * 10 + [0] * 25 + [2] * 10)[:frames]
-
-
-def test_without_output_only_levels_are_measured(tmp_path: Path) -> None:
-    recorder, _, ended = record(None, [(0, 0)] * 5)
-    assert ended and recorder.frames == 50 and recorder.levels.frames == 50
-    assert not os.listdir(tmp_path)

@@ -119,7 +119,7 @@ def test_source_of_bass(graph: Graph, bass: Process, recorded: Recorded) -> None
     """`bag:` publishes the recorded frames with their frame indices."""
     audio = serialization.message_class("bass", "::binaudio::portStruct")
     with graph.collect("/bass/Audio", audio) as messages:
-        wait_for(lambda: messages, what="what the port shows of the live run")
+        wait_for(lambda: messages, what="the message of the live run")
         acquire(graph, f"bag:{recorded.bag}")
         wait_for(lambda: len(messages) > 2 and messages[-1].lastFrameIndex == FRAMES)
     del messages[0]

@@ -18,6 +18,7 @@ import rospy
 from diagnostic_msgs.msg import DiagnosticArray
 
 from rosafe import __version__
+from rosafe.ros1.transport import systemd
 from tests.harness import SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
 from tests.packaging.clone import fresh_copy, without_rights
 
@@ -52,15 +53,11 @@ def web_server() -> Iterator[int]:
 
 
 @PROGRAMS
-def test_help_shows_an_example(graph: Graph, program: str) -> None:
+def test_help_and_version(graph: Graph, program: str) -> None:
     text = graph.run(program, "-h").stdout
     assert f"{program} -b -i left" in text
     for option in ("--background", "--instance", "--name", "--version", "__ip"):
         assert option in text
-
-
-@PROGRAMS
-def test_version(graph: Graph, program: str) -> None:
     assert graph.run(program, "--version").stdout == f"{program.removesuffix('-ros')} {__version__}\n"
 
 
@@ -207,6 +204,71 @@ def test_waiting_for_a_silent_master_can_be_interrupted(graph: Graph) -> None:
         assert node.err.count("\n") == 1, node
 
 
+# --- systemd ----------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def notified(address: str) -> Iterator[list[str]]:
+    """Receive the datagrams of a service."""
+    messages: list[str] = []
+
+    def receive() -> None:
+        while (data := receiver.recv(4096)) != b"end":
+            messages.append(data.decode())
+
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(address)
+        thread = threading.Thread(target=receive)
+        thread.start()
+        try:
+            yield messages
+        finally:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+                sender.sendto(b"end", address)
+            thread.join()
+
+
+@pytest.mark.parametrize("command", [("bass-ros",), ("rosafe", "localize")])
+def test_a_service_waits_for_a_master_and_notifies_the_watchdog(
+    private_graph: tuple[Graph, MasterProcess], tmp_path: Path, command: tuple[str, ...]
+) -> None:
+    """The commands of the units in systemd/. The watchdog is notified also when the master is lost."""
+    graph, master = private_graph
+    master.kill()
+    address = str(tmp_path / "notify")
+    with notified(address) as messages, graph.start(*command, "--wait", NOTIFY_SOCKET=address) as process:
+        wait_for(lambda: len(messages) > 2, what=lambda: str(process))
+        assert messages[-1] == f"STATUS=waiting for a ROS master at {graph.uri}\nEXTEND_TIMEOUT_USEC=30000000"
+        master.start(graph.env)
+        wait_for(lambda: messages.count("READY=1"), what=lambda: f"{messages} {process}")
+        wait_for(lambda: messages.count("WATCHDOG=1") > 2, what=lambda: f"{messages} {process}")
+        master.kill()
+        wait_for(lambda: "no answer from the ROS master" in process.err)
+        known = messages.count("WATCHDOG=1")
+        wait_for(lambda: messages.count("WATCHDOG=1") > known + 2, what=lambda: f"{messages} {process}")
+        assert process.stop(signal.SIGTERM) == 0
+        assert [one for one in messages if one != "WATCHDOG=1"][-2:] == ["READY=1", "STOPPING=1"]
+
+
+@FORKS
+@pytest.mark.parametrize("abstract", [True, False])
+def test_abstract_and_missing_notification_addresses(graph: Graph, abstract: bool) -> None:
+    name = f"rosafe-test-{os.getpid()}"
+    with notified(f"\0{name}") as messages:
+        given = f"@{name}" if abstract else "/nowhere/at/all"
+        with graph.node("bass-ros", "-i", "notifying", NOTIFY_SOCKET=given) as process:
+            assert process.stop(signal.SIGTERM) == 0 and process.complaints == ""
+    assert {"READY=1", "STOPPING=1"} <= set(messages) if abstract else not messages
+
+
+def test_the_interval_of_the_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
+    for pid in ("", str(os.getpid()), "1"):
+        monkeypatch.setenv("WATCHDOG_PID", pid)
+        for text, seconds in {"3000000": 3.0, "": None, "0": None, "-5": None, "2e6": None, "²": None}.items():
+            monkeypatch.setenv("WATCHDOG_USEC", text)
+            assert systemd.watchdog_seconds() == (None if pid == "1" else seconds)
+
+
 # --- an unreachable address --------------------------------------------------------------------------------------
 
 
@@ -318,14 +380,6 @@ def test_the_shells_process_is_the_node(graph: Graph) -> None:
         assert node.out == ""
 
 
-@FORKS
-def test_ends_without_the_master(private_graph: tuple[Graph, MasterProcess]) -> None:
-    graph, master = private_graph
-    with graph.node("bass-ros") as node:
-        master.kill()
-        assert node.stop(signal.SIGTERM) == 0
-
-
 # --- names ------------------------------------------------------------------------------------------------------
 
 
@@ -345,23 +399,6 @@ def test_instance(graph: Graph, arguments: list[str], name: str) -> None:
         wait_for(lambda: f"{name}/kill" in graph.services(), what=lambda: str(node))
         assert not any(service.startswith("/bass/") for service in graph.services())
         assert node.stop() == 0
-
-
-@FORKS
-def test_two_instances(graph: Graph) -> None:
-    with graph.node("bass-ros", "-i", "left") as left, graph.node("bass-ros", "-i", "right") as right:
-        assert left.stop() == 0
-        assert right.alive and "/right/Acquire" in graph.services()
-
-
-@FORKS
-def test_a_second_node_of_the_same_name_takes_over(graph: Graph) -> None:
-    with graph.node("bass-ros") as old, graph.start("bass-ros") as new:
-        assert old.wait() == 0
-        assert "new node registered with same name" in old.out
-        wait_for(lambda: f"Pid: {new.pid}\n" in graph.run("rosnode", "info", "/bass", check=False).stdout)
-        wait_for(lambda: "/bass/Stop" in graph.services())
-        assert graph.call("/bass/Stop").genom_success
 
 
 def test_master_and_address_by_remapping(graph: Graph) -> None:

@@ -16,7 +16,7 @@ import rosservice
 
 from rosafe import interface
 from rosafe.ros1.transport.succession import REASON, MasterProxy, Succession
-from tests.harness import SCRIPTS, Graph, Process, free_port, wait_for
+from tests.harness import SCRIPTS, Graph, Process, wait_for
 
 pytestmark = pytest.mark.forks  # the start of the processes does not matter
 
@@ -113,20 +113,6 @@ def test_one_of_three_concurrent_nodes_remains(graph: Graph) -> None:
 
 
 # --- genomixd and the page --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("command", [["genomixd", "-p"], ["rosafe", "live", "--no-browser", "--port"]])
-def test_servers_take_over_the_name_that_they_are_given(graph: Graph, command: list[str]) -> None:
-    def start() -> Process:
-        return graph.start(*command, str(free_port()), "__name:=server")
-
-    with start() as old:
-        wait_for(lambda: pid(graph, "/server") == old.pid, what=lambda: str(old))
-        with start() as new:
-            assert old.wait() == 0 and old.out.count(REASON) == 1
-            wait_for(lambda: pid(graph, "/server") == new.pid and "/server" in graph.nodes(), what=lambda: str(new))
-            assert new.stop() == 0
-            assert owner(graph, "/server") == ""
 
 
 # --- one that cannot start --------------------------------------------------------------------------------------
