@@ -110,7 +110,6 @@ MAX_MARKED_PERCENT: dict[str, float] = {
     "rosafe": 0.8,
     "rosafe/commands": 1.5,
     "rosafe/declarations": 2.0,
-    "rosafe/demo": 1.5,
     "rosafe/dsp": 2.0,
     "rosafe/eltclsh": 1.6,
     "rosafe/interface": 2.9,
