@@ -179,7 +179,7 @@ def choose(argument: str, seconds: float = math.inf) -> DemoSound:
     source.close()
     title, rate = path.name, source.sample_rate
     if argument.startswith("scene:"):
-        frames = source.frames
+        frames = getattr(source, "frames", None)
         title = title.removeprefix("scene:") if hasattr(source, "scene") else "A source moves from left to right"
     sound = DemoSound(device, title, rate, seconds, source)
     if frames is None or frames >= seconds * rate:

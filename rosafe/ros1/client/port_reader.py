@@ -327,7 +327,11 @@ class PortReader(PortSubscription):
         ------
         TimeoutError
             No frames have arrived, or the reader was closed.
+        rospy.ROSInterruptException
+            This node ends.
         """
+        import rospy
+
         end = math.inf if timeout is None else time.monotonic() + timeout
         with self._arrived:
             while not self._waiting:
@@ -335,6 +339,8 @@ class PortReader(PortSubscription):
                 if rest <= 0 or self._closed:
                     why = f": {self.problem}" if self.problem else "; check that there is sound"
                     raise TimeoutError(f"{self.topic}: expected new frames, got none{why}")
+                if rospy.is_shutdown():
+                    raise rospy.ROSInterruptException(f"{self.topic}: the node ends")
                 self._arrived.wait(min(rest, POLL_SECONDS))
             found = [self._waiting.popleft()]
             while self._waiting and not (self._waiting[0].lost or self._waiting[0].restarted):
