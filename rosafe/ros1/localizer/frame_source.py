@@ -5,8 +5,7 @@ from __future__ import annotations
 import functools
 import struct
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,76 +15,13 @@ from rosafe.audio.files.windows import MAX_INDEX, WindowStream
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface import LAYOUTS
 from rosafe.localization import cues
+from rosafe.localization.live import FrameFormat, NewFrames, StreamRestartedError
 from rosafe.ros import FrameClock
 from rosafe.ros1.component import serialization
 
 READ_BYTES = 2**17  # per read of a subscriber
 KEPT_MESSAGES = 8  # of each port, until the other ports have the same block
 _HEAD = struct.Struct("<IQQ")  # the beginning of a message: sampleRate, lastFrameIndex, framesOnPort
-
-
-@dataclass(frozen=True)
-class FrameFormat:
-    """The frames of the ports: sizes in samples.
-
-    Attributes
-    ----------
-    sample_rate : float
-        Hz.
-    channels : int
-        Number of channels.
-    window, hop, block : int
-        Length and distance of frames, and the block of the input, in samples.
-    """
-
-    sample_rate: float
-    channels: int
-    window: int
-    hop: int
-    block: int
-
-    @property
-    def rest(self) -> float:
-        """Samples after the newest frame of a message: exact if the hop divides the block, otherwise an estimate."""
-        return -self.window % self.hop if self.block % self.hop == 0 else self.hop / 2
-
-
-@dataclass(frozen=True)
-class NewFrames:
-    """Successive frames of all representations.
-
-    Attributes
-    ----------
-    features : mapping
-        As for `Localizer.update`.
-    middles : ndarray, (F,)
-        The clock time of the middle of each frame, s.
-    lost : int
-        Number of frames that are missing before them.
-    """
-
-    features: Mapping[str, FloatArray]
-    middles: FloatArray
-    lost: int
-
-    def select(self, frames: Any) -> NewFrames:
-        """Return some of the frames: a slice, or an array of bool."""
-        features = {kind: array[..., frames] for kind, array in self.features.items()}
-        return NewFrames(features, self.middles[frames], 0)
-
-    @staticmethod
-    def joined(parts: Sequence[NewFrames]) -> NewFrames:
-        """Return all frames of `parts`."""
-        if len(parts) == 1:
-            return parts[0]
-        features = {
-            kind: np.concatenate([part.features[kind] for part in parts], axis=-1) for kind in parts[0].features
-        }
-        return NewFrames(features, np.concatenate([part.middles for part in parts]), 0)
-
-
-class StreamRestartedError(Exception):
-    """The index of the stream has fallen; the text says from where to where."""
 
 
 class _Undecoded:
@@ -107,7 +43,7 @@ def _message_class(idl: str) -> Any:
 class _Port:
     """The messages of one port. All methods but `close` need the lock of the source."""
 
-    def __init__(self, topic: str, kind: str, format_: FrameFormat, source: FrameSource) -> None:
+    def __init__(self, topic: str, kind: str, format_: FrameFormat, source: PortSource) -> None:
         self.kind = kind
         self.problem = ""
         self.messages: dict[int, Any] = {}  # the newest, by lastFrameIndex
@@ -188,7 +124,7 @@ class _Port:
         return np.asarray(self._used.left[:, columns])
 
 
-class FrameSource:
+class PortSource:
     """New frames of the representations, from rospy's threads to the one that localizes.
 
     Parameters

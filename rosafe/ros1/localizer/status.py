@@ -8,13 +8,12 @@ from collections.abc import Callable
 from typing import Any
 
 import rospy
-from diagnostic_msgs.msg import DiagnosticStatus
 
+from rosafe.localization.live import ERROR, OK, WARN
 from rosafe.ros1.transport.log_throttle import ThrottledLog
 from rosafe.system.terminal import printable
 
 LOG_SECONDS = 10.0  # in which problems that differ only in numbers are logged once
-OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
 class NodeStatus:
