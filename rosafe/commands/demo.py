@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from rosafe.commands._launcher import Launcher
     from rosafe.ros import Frames
+    from rosafe.ros1.client.component_client import ComponentClient
 
 PLOT_FILE = "rosafe-demo.png"
 SOUND_FILES = {".wav", ".flac", ".ogg", ".oga", ".opus", ".mp3", ".aif", ".aiff", ".aifc", ".au", ".caf", ".w64"}
@@ -271,41 +272,43 @@ class _Port:
         return (self.first + np.arange(data.shape[-1])) * HOP_SECONDS + FRAME_SECONDS / 2, data
 
 
+def _check(launcher: Launcher) -> None:
+    """Raise CommandError if a node has ended."""
+    for process in launcher.ended:
+        raise CommandError(f"{process.name}-ros has ended: {process.detail}")
+
+
+async def _request(
+    launcher: Launcher, client: ComponentClient, node: str, service: str, arguments: Mapping[str, Any]
+) -> None:
+    """Print and make a request; raise CommandError if it fails."""
+    say(f"$ {command_line(node, service, arguments)}")
+    try:
+        declared = client.service(service)
+        await client.call(declared, client.arguments(declared, {**arguments}))
+    except ComponentError as problem:
+        _check(launcher)
+        raise CommandError(f"/{node}/{service} failed: {format_error(problem)}") from None
+
+
 async def _record(launcher: Launcher, sound: DemoSound) -> tuple[dict[str, _Port], Any]:
     """Start the nodes, make the requests, and record all ports; return them and the parameters of the processors."""
     import rospy
-
-    from rosafe.view import report
-
-    def check() -> None:
-        for process in launcher.ended:
-            raise CommandError(f"{process.name}-ros has ended: {process.detail}")
 
     say(f"rosAFE, the auditory front-end, on {sound.device} at {sound.sample_rate} Hz")
     say(f"private master at {os.environ['ROS_MASTER_URI']}; starting bass-ros and rosAFE-ros")
     async with open_graph() as graph:
         bass, afe = await asyncio.gather(*(launcher.start_node(graph, name) for name in ("bass", "rosAFE")))
-        check()
+        _check(launcher)
         if bass is None or afe is None:
             raise CommandError("the nodes do not start")
         rospy.init_node("rosafe_demo", argv=["rosafe_demo"], disable_signals=True, log_level=rospy.FATAL)
         ports = {kind: _Port(kind) for kind in NAMES}
-
-        async def request(node: str, service: str, arguments: Mapping[str, Any]) -> None:
-            client = afe if node == "rosAFE" else bass
-            say(f"$ {command_line(node, service, arguments)}")
-            try:
-                declared = client.service(service)
-                await client.call(declared, client.arguments(declared, {**arguments}))
-            except ComponentError as problem:
-                check()
-                raise CommandError(f"/{node}/{service} failed: {format_error(problem)}") from None
-
         for step in requests(sound):
-            await request(*step)
+            await _request(launcher, afe if step[0] == "rosAFE" else bass, *step)
         deadline = time.monotonic() + FIRST_SECONDS
         while not all(port.starts for port in ports.values()):
-            check()
+            _check(launcher)
             if time.monotonic() > deadline:
                 raise CommandError(f"{sound.device}: no sound arrives")
             await asyncio.sleep(0.02)
@@ -314,27 +317,36 @@ async def _record(launcher: Launcher, sound: DemoSound) -> tuple[dict[str, _Port
         if sound.source is not None:
             say("restarting the sound from the beginning:")
             begin = {kind: (port.starts + 1, 0) for kind, port in ports.items()}
-            await request(*requests(sound)[1])
-        say(f"recording {len(ports)} ports for {sound.seconds:.1f} s")
-        elapsed, shown, moved = 0.0, 0.0, time.monotonic()
-        while elapsed < sound.seconds and time.monotonic() < moved + SILENT_SECONDS:
-            check()
-            await asyncio.sleep(0.02)
-            if all(port.starts >= begin[kind][0] for kind, port in ports.items()):
-                now = min(port.index - begin[kind][1] for kind, port in ports.items()) / sound.sample_rate
-                elapsed, moved = (now, time.monotonic()) if now > elapsed else (elapsed, moved)
-            if elapsed >= shown + 1:
-                shown = elapsed
-                left, right = (report.level_db(ear) for ear in ports["input"].pieces[-1])
-                say(f"{elapsed:5.1f} s   left {left:6.1f} dB   right {right:6.1f} dB")
-        for port in ports.values():
-            port.reader.close()
+            await _request(launcher, bass, *requests(sound)[1])
+        await _follow(launcher, sound, ports, begin)
+    return ports, parameters
+
+
+async def _follow(
+    launcher: Launcher, sound: DemoSound, ports: Mapping[str, _Port], begin: Mapping[str, tuple[int, int]]
+) -> None:
+    """Wait until all ports have the seconds of the sound, or it has ended; `begin` has starts and index of each."""
+    from rosafe.view import report
+
+    say(f"recording {len(ports)} ports for {sound.seconds:.1f} s")
+    elapsed, shown, moved = 0.0, 0.0, time.monotonic()
+    while elapsed < sound.seconds and time.monotonic() < moved + SILENT_SECONDS:
+        _check(launcher)
+        await asyncio.sleep(0.02)
+        if all(port.starts >= begin[kind][0] for kind, port in ports.items()):
+            now = min(port.index - begin[kind][1] for kind, port in ports.items()) / sound.sample_rate
+            elapsed, moved = (now, time.monotonic()) if now > elapsed else (elapsed, moved)
+        if elapsed >= shown + 1:
+            shown = elapsed
+            left, right = (report.level_db(ear) for ear in ports["input"].pieces[-1])
+            say(f"{elapsed:5.1f} s   left {left:6.1f} dB   right {right:6.1f} dB")
+    for port in ports.values():
+        port.reader.close()
     if elapsed < sound.seconds:
         child = launcher.processes["bass"].child
         if child is not None and (failures := re.findall(r"\[ERROR\].*the acquisition has ended: (.*)", child.err)):
             raise CommandError(f"{sound.device}: {failures[-1].removesuffix(COLOUR_END)}")
         say(f"{sound.device} has ended")
-    return ports, parameters
 
 
 def _show(sound: DemoSound, ports: Mapping[str, _Port], parameters: Any, plot_file: Path) -> None:
@@ -342,8 +354,6 @@ def _show(sound: DemoSound, ports: Mapping[str, _Port], parameters: Any, plot_fi
     import numpy as np
 
     from rosafe.localization import angles
-    from rosafe.localization.localize import localize
-    from rosafe.localization.localizer import SPHERE
     from rosafe.view import axes, figure, report  # matplotlib takes a second to import
     from rosafe.view.representations import Representations
 
@@ -359,32 +369,7 @@ def _show(sound: DemoSound, ports: Mapping[str, _Port], parameters: Any, plot_fi
     )
     if len(shown.times) < 2:
         raise CommandError(f"{sound.device}: not enough sound for a figure")
-    head = getattr(sound.source, "scene", None)
-    head = SPHERE if head is None else head.head
-    found, truth, nearest = None, {}, None
-    say("\nlocalizing; at the first use of a head and sample rate, they are learned, which takes up to 30 s")
-    try:
-        found = localize(np.concatenate(ports["input"].pieces, axis=-1), sound.sample_rate, head, WINDOW_SECONDS)
-    except ValueError as problem:
-        say(f"the direction is not estimated: {problem}")
-    if found is not None:
-        complete = found["time"] >= WINDOW_SECONDS  # in the middle of the window, a source was in the mean direction
-        found = {**found, **{name: found[name][complete] for name in ("time", "azimuth", "confidence", "posterior")}}
-        times = found["time"] = found["time"] + ports["input"].first / sound.sample_rate - WINDOW_SECONDS / 2
-    if found is not None and len(times):
-        series = {"estimate": found["azimuth"]}
-        if (truth_of := getattr(sound.source, "truth", None)) is not None:
-            truth = true_azimuths(truth_of, times, head.front_back_equal)
-            nearest = nearest_source(found["azimuth"], truth)
-            series["truth"] = nearest[1]
-        every = next((step for step in (0.25, 0.5, 1.0, 2.0, 5.0, 10.0) if (times[-1] - times[0]) / step <= 21), 30.0)
-        say("\ndirection of the source, estimated (E)" + (" and true (T), or both (X)" if truth else ""))
-        say(report.path_table(times, series, every))
-    if nearest is not None:
-        errors = np.abs(angles.difference(series["estimate"], nearest[1]))
-        if np.isfinite(errors).any():
-            rms, largest = np.sqrt(np.nanmean(errors**2)), np.nanmax(errors)
-            say(f"RMS error {rms:.1f} deg, largest {largest:.0f} deg")
+    found, truth, nearest = _directions(sound, ports["input"])
     subtitle = (
         f"{sound.device.split('/')[-1]} at {sound.sample_rate} Hz, {len(shown.center_frequencies)} channels, "
         f"{shown.times[-1] - shown.times[0]:.1f} s from the ports of rosAFE"
@@ -395,7 +380,7 @@ def _show(sound: DemoSound, ports: Mapping[str, _Port], parameters: Any, plot_fi
         say("no source was found")
         return
     last = int(np.flatnonzero(np.isfinite(found["azimuth"]))[-1])
-    azimuth, at = float(found["azimuth"][last]), f"at {times[last]:.1f} s:"
+    azimuth, at = float(found["azimuth"][last]), f"at {found['time'][last]:.1f} s:"
     estimate = f"estimate {report.side(azimuth).strip()} (confidence {found['confidence'][last]:.2f})"
     if nearest is None:
         say(f"{at} {estimate}")
@@ -403,6 +388,53 @@ def _show(sound: DemoSound, ports: Mapping[str, _Port], parameters: Any, plot_fi
         true = float(nearest[1][last])
         error = abs(float(angles.difference(azimuth, true)))
         say(f"{at} the {nearest[0][last]} is {report.side(true).strip()}, {estimate}, error {error:.0f} deg")
+
+
+def _directions(sound: DemoSound, port: _Port) -> tuple[dict[str, Any] | None, dict[str, np.ndarray], Any]:
+    """Localize the sound, and print the path of the source.
+
+    Returns
+    -------
+    found : dict or None
+        As of `rosafe.localize`, at the middle of each window: then a moving source was in the mean direction.
+    truth : dict
+        True azimuths by source.
+    nearest : tuple or None
+        As of `nearest_source`.
+    """
+    import numpy as np
+
+    from rosafe.localization import angles
+    from rosafe.localization.localize import localize
+    from rosafe.localization.localizer import SPHERE
+    from rosafe.view import report
+
+    scene = getattr(sound.source, "scene", None)
+    head = SPHERE if scene is None else scene.head
+    say("\nlocalizing; at the first use of a head and sample rate, they are learned, which takes up to 30 s")
+    try:
+        found = localize(np.concatenate(port.pieces, axis=-1), sound.sample_rate, head, WINDOW_SECONDS)
+    except ValueError as problem:
+        say(f"the direction is not estimated: {problem}")
+        return None, {}, None
+    complete = found["time"] >= WINDOW_SECONDS
+    found |= {name: found[name][complete] for name in ("time", "azimuth", "confidence", "posterior")}
+    times = found["time"] = found["time"] + port.first / sound.sample_rate - WINDOW_SECONDS / 2
+    if not len(times):
+        return None, {}, None
+    series, truth, nearest = {"estimate": found["azimuth"]}, {}, None
+    if (truth_of := getattr(sound.source, "truth", None)) is not None:
+        truth = true_azimuths(truth_of, times, head.front_back_equal)
+        nearest = nearest_source(found["azimuth"], truth)
+        series["truth"] = nearest[1]
+    every = next((step for step in (0.25, 0.5, 1.0, 2.0, 5.0, 10.0) if (times[-1] - times[0]) / step <= 21), 30.0)
+    say("\ndirection of the source, estimated (E)" + (" and true (T), or both (X)" if truth else ""))
+    say(report.path_table(times, series, every))
+    if nearest is not None:
+        errors = np.abs(angles.difference(found["azimuth"], nearest[1]))
+        if np.isfinite(errors).any():
+            say(f"RMS error {np.sqrt(np.nanmean(errors**2)):.1f} deg, largest {np.nanmax(errors):.0f} deg")
+    return found, truth, nearest
 
 
 def true_azimuths(truth: Callable[[float], Any], times: np.ndarray, folded: bool) -> dict[str, np.ndarray]:

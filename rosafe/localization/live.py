@@ -43,6 +43,9 @@ class Status(Protocol):
     def set_error(self, part: str, problem: Exception) -> None:
         """Report an unexpected error of a part that continues."""
 
+    def warn(self, line: str, kind: str) -> None:
+        """Write a line of a kind to the log, once in some seconds."""
+
     def clear(self, part: str) -> None:
         """Remove the state of a part."""
 
@@ -383,7 +386,7 @@ class FrameSource(Protocol):
 
     @property
     def missing(self) -> str:
-        """What does not arrive."""
+        """The kind of message that does not arrive."""
 
     def take(self) -> NewFrames | None:
         """Return the frames since the last call; None if they are not enough. Raises StreamRestartedError."""
@@ -416,8 +419,6 @@ class LocalizationLoop:
         Called if messages do not fit the processors that were requested.
     clock : callable
         Returns the clock time in s.
-    report : callable
-        Called with a line for the log and its kind; writes it once in some seconds.
     """
 
     def __init__(
@@ -428,11 +429,10 @@ class LocalizationLoop:
         status: Status,
         suspicious: Callable[[], None],
         clock: Callable[[], float],
-        report: Callable[[str, str], None],
     ) -> None:
         self._localizer_for = localizer_for
         self._publishing = publishing
-        self._clock, self._report = clock, report
+        self._clock = clock
         self._queue = queue
         self._status = status
         self._suspicious = suspicious
@@ -528,7 +528,7 @@ class LocalizationLoop:
         try:
             new = source.take()
         except StreamRestartedError as restart:
-            self._report(f"a new stream of sound: {restart}; localization begins again", "stream")
+            self._status.warn(f"a new stream of sound: {restart}; localization begins again", "stream")
             self._begin_again()
             return False
         if source.problem:
@@ -545,7 +545,7 @@ class LocalizationLoop:
         if steps.min() < -TIME_SLACK or steps.max() > MAX_PAUSE:
             jump = f"{steps[np.abs(steps).argmax()]:.3f} s"
             advice = "localization begins again; with use_sim_time, check /clock"
-            self._report(f"the time jumped by {jump}; {advice}", "time")
+            self._status.warn(f"the time jumped by {jump}; {advice}", "time")
             self._begin_again()
             return False
         middles = np.maximum.accumulate(middles)
@@ -566,7 +566,7 @@ class LocalizationLoop:
     def _append(self, new: NewFrames, localizer: Localizer) -> None:
         if new.lost:
             self._status.count("lost frames", new.lost)
-            self._report(f"{new.lost} frames of rosAFE were lost before {new.middles[0]:.3f} s", "lost")
+            self._status.warn(f"{new.lost} frames of rosAFE were lost before {new.middles[0]:.3f} s", "lost")
             if new.lost * localizer.hop > GAP_SECONDS:
                 self._begin_again()
         self._queue.append(new)

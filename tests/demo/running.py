@@ -111,7 +111,7 @@ def check_walk(text: str) -> None:
     """
     check_table(text, 44100, 12000, 10.0)
     azimuths = np.array([line for line in path(text) if line[0] <= 10])
-    assert len(azimuths) >= 9  # one a second if the recording is longer than 10.5 s, else two
+    assert len(azimuths) >= 9  # one a second if the recording is longer than 10.5 s, otherwise two
     _, estimate, truth = azimuths.T
     assert estimate[0] > 65 and estimate[-1] < -65
     assert (np.diff(estimate) < 5).all() and np.abs(estimate - truth).max() < 8

@@ -47,7 +47,7 @@ def blocks(language: str) -> list[str]:
 def link_checkout(folder: Path) -> dict[str, str]:
     """Fill `folder` with links to the checkout, and return an environment for the commands of the README.
 
-    Wrappers in its PATH do what a user does: they set the port of roscore, end `rostopic hz`, and wait for the nodes.
+    Wrappers in its PATH act as a user does: they set the port of roscore, end `rostopic hz`, and wait for the nodes.
     """
     for entry in ROOT.iterdir():
         if entry.name not in ("rosafe-demo", ".git"):

@@ -51,7 +51,7 @@ def overlap(window: np.ndarray, before: np.ndarray, count: int) -> bool:
 
 
 class Step(NamedTuple):
-    """What a message adds to a stream.
+    """The frames that a message adds to a stream.
 
     Attributes
     ----------

@@ -21,7 +21,7 @@ from rosafe.ros1.client.tree_snapshot import TreeSnapshot
 from rosafe.system.terminal import printable
 
 READ_BYTES = 2**17  # per read: allocating a larger buffer takes longer than reading several times
-FORGET_SECONDS = 3.0  # after the last bad message until the problem is no longer shown
+FORGET_SECONDS = 3.0  # after the last bad message until the problem is hidden
 ASK_SECONDS = 1.0  # between two questions to the node for the same reason
 POLL_SECONDS = 0.5
 AUDIO = "Audio"  # the port of bass
@@ -132,8 +132,8 @@ class PortSubscription:
         self._stream = WindowStream()
         self._format: _Format | None = None
         self._restarted = False  # whether the next frames begin another stream
-        self._asks = tree is None
-        self._asked = ("", 0.0)  # the reason and time (time.monotonic) of the last question to the node
+        # the reason and time (time.monotonic) of the last question to the node; None if it is not asked
+        self._asked = ("", 0.0) if tree is None else None
         self._clock: FrameClock | None = None
         self._problems = _Problems(self.topic, grace_seconds, ThrottledLog(rospy.logwarn))
         self._lock = threading.Lock()
@@ -261,10 +261,10 @@ class PortSubscription:
         try:
             self._compare(message)
         except (ValueError, LookupError) as problem:
-            asked, self._asked = self._asked, (str(problem), time.monotonic())
-            if not self._asks or (asked[0] == self._asked[0] and self._asked[1] < asked[1] + ASK_SECONDS):
-                self._asked = asked
+            now = time.monotonic()
+            if self._asked is None or (self._asked[0] == str(problem) and now < self._asked[1] + ASK_SECONDS):
                 raise
+            self._asked = str(problem), now
             self._use(_ask(self._node))
             self._compare(message)
 

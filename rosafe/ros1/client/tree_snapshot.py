@@ -10,7 +10,7 @@ from typing import Any
 from rosafe.audio.files.windows import MAX_RATE
 from rosafe.interface import KINDS, Representation
 
-MAX_SIZE = 2**20  # of an axis
+MAX_SIZE = 2**20  # largest length along an axis
 HOP_TOLERANCE = 1e-9  # relative, within which a hop is a whole number of samples
 
 

@@ -26,12 +26,10 @@ from rosafe.ros1.localizer.status import NodeStatus
 from rosafe.ros1.localizer.transforms import TransformBuffer
 from rosafe.ros1.localizer.tree_link import LocalizerPorts, TreeLink
 from rosafe.ros1.transport import registration
-from rosafe.ros1.transport.log_throttle import ThrottledLog
 from rosafe.ros1.transport.self_check import SelfCheck
 from rosafe.system.terminal import printable
 
 UP_SECONDS = 10.0  # to register a node that starts at the master
-LOG_SECONDS = 10.0  # in which lost frames are logged once
 PROGRESS_STEP = 0.1  # of the part of a head that is learned, between two lines in the log
 
 
@@ -78,7 +76,6 @@ class LocalizerNode:
             self._status,
             lambda: self._link.check_now(),
             rospy.get_time,
-            ThrottledLog(rospy.logwarn, LOG_SECONDS),
         )
         self._link = TreeLink(
             afe, settings.connect, self._models.model_for, self._connect, self._status, self._loop.is_stalled

@@ -63,6 +63,10 @@ class NodeStatus:
         text = f"unexpected error, the node tries again: {type(problem).__name__}: {printable(str(problem))}"
         self.set(part, ERROR, text, log=new)
 
+    def warn(self, line: str, kind: str) -> None:
+        """Write a line of a kind to the log, once in some seconds."""
+        self._log[WARN](line, kind)
+
     def clear(self, part: str) -> None:
         """Remove the state of a part."""
         with self._lock:

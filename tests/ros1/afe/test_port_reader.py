@@ -78,7 +78,7 @@ def check(parts: list[Frames], result: np.ndarray, kind: str) -> None:
 
 
 def test_lost_frames_are_counted_and_located(afe: Session, ild: PortReader) -> None:
-    """A window has 8 frames: those of a message that is missed are in the next one, those of six are not."""
+    """Windows have ten frames. After twenty missed messages, the next one has the frames of the last."""
     signal = noise(60 * 1600)
     result = expected(signal, 1600)["ild"]
     microphone = afe.build(*CHAIN, "IldProc", block=1600, bufferSize_s_port=0.1)
@@ -114,7 +114,7 @@ def test_restarts_and_changes_begin_again(afe: Session, ild: PortReader) -> None
 
 
 def test_a_processor_of_running_sound(afe: Session, ild: PortReader) -> None:
-    """The zeros in its window, from before its first block, are no frames."""
+    """Its window is full of zeros before its first block. They are skipped."""
     microphone = afe.build(block=1600)
     before, sound = noise(16000), noise(16000, 2)
     microphone.play(before)

@@ -52,7 +52,6 @@ class Robot:
             self.status,
             lambda: None,
             lambda: START + self.index / RATE,
-            lambda *_: None,
         )
         model = Localizer(RATE, str(head)).model
         window, hop = (round(model.parameters[f"cc_{name}"] * RATE) for name in ("wSizeSec", "hSizeSec"))

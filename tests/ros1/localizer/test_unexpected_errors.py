@@ -89,7 +89,7 @@ class Fake:
         publishers = namespace(begin_again=lambda: None, publish=self.publish)
         unused: Any = None
         queue = FrameQueue(FixedHead(), mute)
-        self.loop = LocalizationLoop(unused, publishers, queue, self.status, unused, lambda: 1.0, unused)
+        self.loop = LocalizationLoop(unused, publishers, queue, self.status, unused, lambda: 1.0)
         self.loop._localizer, self.loop._source = self.localizer, self.source
 
     def fail(self, step: str) -> None:
