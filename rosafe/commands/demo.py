@@ -307,7 +307,9 @@ async def _record(launcher: Launcher, sound: DemoSound) -> tuple[dict[str, _Port
         for step in requests(sound):
             await _request(launcher, afe if step[0] == "rosAFE" else bass, *step)
         deadline = time.monotonic() + FIRST_SECONDS
-        while not all(port.starts for port in ports.values()):
+        # An index that falls shows the restart of the sound: it has to be above that of the first block.
+        least = min(2 * sound.block, round(sound.seconds * sound.sample_rate))
+        while not all(port.index >= least for port in ports.values()):
             _check(launcher)
             if time.monotonic() > deadline:
                 raise CommandError(f"{sound.device}: no sound arrives")

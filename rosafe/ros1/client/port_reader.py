@@ -195,12 +195,12 @@ class PortSubscription:
 
     def _advance(self, message: Any, end: int, format_: _Format) -> None:
         window = np.asarray(message.left if self._kind == AUDIO else getattr(message, _fields(self._kind)[0]))
-        first = not self._stream.end
+        first = not self._stream.end and self._kind != AUDIO
         step = self._stream.advance(end, window[0] if window.ndim == 3 else window)  # one lag shows the new frames
         self._restarted |= step.restarted
         self.lost += step.lost
         parts = self._parts(message, window.shape[-1] - step.new)
-        skipped = _zeros(parts) if first or step.restarted else 0  # the window of a processor is full of zeros at first
+        skipped = _zeros(parts) if first else 0  # the window of a processor is full of zeros at first
         parts = tuple(part[..., skipped:] for part in parts) if skipped else parts
         if not parts[0].shape[-1]:
             return
@@ -252,7 +252,9 @@ class PortSubscription:
         name = self.topic.rpartition("/")[2]
         for one in tree.processors.values():
             if one.kind == self._kind and one.topic.rpartition("/")[2] == name and one.rate and tree.sample_rate:
-                self._begin(_Format(one.rate, tree.sample_rate, one.shapes(), *tree.grid(one)))
+                found = _Format(one.rate, tree.sample_rate, one.shapes(), *tree.grid(one))
+                if found != self._format:
+                    self._begin(found)
                 return
         raise LookupError(f"expected the port of a processor with sound, got none of this name at {self._node}")
 
