@@ -18,9 +18,11 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
-from rosafe.demo.processes import Child, ProcessGroup  # noqa: E402
-from rosafe.demo.session import NAMES, DemoSession  # noqa: E402
-from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE  # noqa: E402
+from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE, all_services  # noqa: E402
+from rosafe.ros1.component import generate  # noqa: E402
+from rosafe.ros1.transport.master import PrivateMaster  # noqa: E402
+from rosafe.ros1.transport.paths import program  # noqa: E402
+from rosafe.system.processes import Child, ProcessGroup  # noqa: E402
 
 PYTHON = "/usr/bin/python3"
 AUDIO = "/bass/Audio"
@@ -49,10 +51,49 @@ class Subscriber:
         return json.loads(self._result.read_text())
 
 
+class Session:
+    """A private master with both nodes; this process is a node, too. `close` ends all of them."""
+
+    def __init__(self, folder: str) -> None:
+        for name in [name for name in os.environ if name.startswith("ROS_")]:
+            del os.environ[name]
+        os.environ.update(ROS_IP="127.0.0.1", ROS_LOG_DIR=folder, ROS_HOME=folder, **generate.environment())
+        os.environ["PATH"] = f"{HERE.parent / 'scripts'}:{os.environ['PATH']}"
+        generate.ensure_messages()
+        self._master = PrivateMaster()
+        os.environ["ROS_MASTER_URI"] = self._master.uri
+        self._children = ProcessGroup(os.environ)
+        self._nodes = [self._children.start(program(script)) for script in ("bass-ros", "rosAFE-ros")]
+        import rosgraph
+        import rospy
+
+        master = rosgraph.Master("/benchmark")
+        expected = {f"/{component.name}/{service.name}" for component, service in all_services()}
+        self.wait(lambda: expected <= {name for name, _ in master.getSystemState()[2]}, "the nodes do not start")
+        rospy.init_node("benchmark", argv=["benchmark"], disable_signals=True, log_level=rospy.FATAL)
+
+    def wait(self, condition: Callable[[], bool], problem: str, seconds: float = 30.0) -> None:
+        """Wait for a condition; raise RuntimeError after `seconds`, or if a node ends."""
+        end = time.monotonic() + seconds
+        while not condition():
+            ended = [node for node in self._nodes if node.has_ended()]
+            if ended or time.monotonic() > end:
+                raise RuntimeError(f"{problem}: {[node.err for node in ended]}")
+            time.sleep(0.02)
+
+    def close(self) -> None:
+        """End all processes."""
+        import rospy
+
+        self._children.close()
+        rospy.signal_shutdown("the benchmark is over")
+        self._master.close()
+
+
 class Bench:
     """The running nodes; created by `bench`."""
 
-    def __init__(self, session: DemoSession, children: ProcessGroup, folder: str) -> None:
+    def __init__(self, session: Session, children: ProcessGroup, folder: str) -> None:
         self.session = session
         self._children = children
         self._folder = folder
@@ -77,13 +118,13 @@ class Bench:
         self.call("/rosAFE/InputProc", nFramesPerBlock=block, bufferSize_s_port=port_seconds)
         for kind in CORE_REPRESENTATIONS.values():
             if kind.parent:
-                self.call(f"/rosAFE/{kind.request}", name=NAMES[kind.kind], upperDepName=NAMES[kind.parent])
+                self.call(f"/rosAFE/{kind.request}", name=kind.name, upperDepName=KINDS[kind.parent].name)
 
     def subscribe(self, topics: Iterable[str]) -> Subscriber:
         """Subscribe from another process; return after the first message on every topic."""
         subscriber = Subscriber(self._children, self._folder, topics)
         self.session.wait(
-            lambda: "ready" in subscriber.child.out, UP_SECONDS, "the subscriber received no message on some topic"
+            lambda: "ready" in subscriber.child.out, "the subscriber received no message on some topic", UP_SECONDS
         )
         return subscriber
 
@@ -133,8 +174,9 @@ def in_child(function: Callable[..., Any], *arguments: Any) -> Any:
 @contextmanager
 def bench() -> Iterator[Bench]:
     """Run both nodes with a private master; all processes end with the context."""
-    with tempfile.TemporaryDirectory() as folder, closing(DemoSession(folder, lambda: None)) as session:
-        session.start_nodes()
-        session.join()
-        with closing(ProcessGroup(os.environ)) as children:
-            yield Bench(session, children, folder)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        closing(Session(folder)) as session,
+        closing(ProcessGroup(os.environ)) as children,
+    ):
+        yield Bench(session, children, folder)

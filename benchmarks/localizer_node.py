@@ -96,7 +96,7 @@ def measure() -> dict[str, float]:
         rospy.Subscriber("/bass/sceneTruth", SceneTruth, truths.append)
         node = bench.start("rosafe", "localize")
         bench.session.wait(
-            lambda: "localizing with" in node.err, START_SECONDS, f"the localizer does not start: {node.err}"
+            lambda: "localizing with" in node.err, f"the localizer does not start: {node.err}", START_SECONDS
         )
         bench.call(
             "/bass/Acquire", device=f"scene:{scene}", sampleRate=graph.RATE, nFramesPerChunk=2205, nChunksOnPort=20

@@ -18,8 +18,8 @@ from contextlib import closing
 import graph
 import report
 
-from rosafe.demo.processes import ProcessGroup
 from rosafe.ros1.component import generate
+from rosafe.system.processes import ProcessGroup
 
 FILL_SECONDS = 2.0  # until the ports hold one second
 UP_SECONDS = 20.0

@@ -34,7 +34,7 @@ def check_representation(
     """Raise AssertionError, with the reason, unless a representation fulfils the requirements of the tree.
 
     It checks blocks of different lengths, including empty ones; shape, type and contiguity of each output, finite
-    numbers and the number of frames; that the input is not modified and shares no memory with the output; a change of
+    numbers and the number of frames; an input that is not modified and shares no memory with the output; a change of
     each parameter and of the number of channels during the sound; parents with parameters at their limits; derived
     values; silence, loud and long sound; values out of range; copies of the stage; and `reset`.
 

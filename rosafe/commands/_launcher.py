@@ -14,9 +14,9 @@ import aiohttp
 from rosgraph.names import get_ros_namespace
 
 from rosafe.commands import CommandError
-from rosafe.demo.processes import Child, ProcessGroup
 from rosafe.interface import COMPONENTS, ComponentError
 from rosafe.ros1.transport import master, paths
+from rosafe.system.processes import Child, ProcessGroup
 from rosafe.system.terminal import printable
 
 if TYPE_CHECKING:

@@ -199,8 +199,8 @@ def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
     become_node("rosafe_localize")
     import rospy
 
-    from rosafe.ros1.localizer import ear_check, noise_calibration, noise_measurement
-    from rosafe.ros1.localizer.frame_listener import FrameListener, NoFramesError
+    from rosafe.ros1.localizer import ear_check, measurement, noise
+    from rosafe.ros1.localizer.measurement import FrameListener, NoFramesError
     from rosafe.ros1.localizer.settings import read_settings
 
     def say(text: str) -> None:
@@ -214,10 +214,10 @@ def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
                 for line in report.lines if report is not None else ():
                     say(line)
                 return 1 if report is None or report.problems else 0
-            path = noise_calibration.file_of(settings.noise) or noise_calibration.default_path()
+            path = noise.file_of(settings.noise) or noise.default_path()
             if path is None:
                 raise ValueError("--noise: expected a file, as there is no cache folder of this user alone, got none")
-            noise_measurement.calibrate(listener, options.calibrate_noise, path, say)
+            measurement.calibrate(listener, options.calibrate_noise, path, say)
     except (NoFramesError, ValueError, OSError, OutputError) as problem:
         raise CommandError(printable(str(problem))) from None
     return 0

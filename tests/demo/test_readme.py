@@ -47,7 +47,7 @@ def blocks(language: str) -> list[str]:
 def link_checkout(folder: Path) -> dict[str, str]:
     """Fill `folder` with links to the checkout, and return an environment for the commands of the README.
 
-    Wrappers in its PATH do what a user does: they set the port of roscore, end `rostopic hz`, and wait for the nodes.
+    Wrappers in its PATH act as a user does: they set the port of roscore, end `rostopic hz`, and wait for the nodes.
     """
     for entry in ROOT.iterdir():
         if entry.name not in ("rosafe-demo", ".git"):
@@ -135,9 +135,7 @@ def test_the_python_example(tmp_path: Path) -> None:
     line = f". scripts/env.sh && exec {PYTHON} -c {shlex.quote(code)}"
     with Process(["bash", "-c", line], env, tmp_path) as done:
         assert done.wait() == 0, done
-        assert done.out.startswith("(16, 99) [  80.  ") and done.err == ""
-    statements = [line for line in code.splitlines() if line]
-    assert len(statements) == 5
+        assert re.match(r"\(16, 99\) \[  80\.  (.*\n)+\(2, \d+, 99\) \[  80\. ", done.out) and done.err == ""
 
 
 def test_three_lines_from_a_sound_to_a_direction(

@@ -22,7 +22,7 @@ import rosafe
 from rosafe.localization import angles, cues, model_cache, results
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.noise import NoiseCalibration
-from rosafe.ros1.localizer import noise_calibration
+from rosafe.ros1.localizer import noise
 from rosafe.system import trust
 from tests.harness import PYTHON, ROOT
 from tests.localization.test_head import write_sofa
@@ -482,7 +482,7 @@ def test_models_that_other_users_could_have_written_are_not_used(
     assert len(learned) == 2
     if "file" not in part:
         assert (path.read_bytes(), path.stat().st_mtime_ns) == before
-        assert noise_calibration.default_path() is None
+        assert noise.default_path() is None
 
 
 def test_without_a_home_there_is_no_cache(monkeypatch: pytest.MonkeyPatch, learned: list[str]) -> None:
@@ -494,13 +494,13 @@ def test_without_a_home_there_is_no_cache(monkeypatch: pytest.MonkeyPatch, learn
     monkeypatch.setattr(pwd, "getpwuid", nobody)
     _model()
     _model()
-    assert len(learned) == 2 and trust.user_cache() is None and noise_calibration.default_path() is None
+    assert len(learned) == 2 and trust.user_cache() is None and noise.default_path() is None
 
 
 def test_a_noise_calibration_that_is_a_link_is_not_used(tmp_path: Path, learned: list[str]) -> None:
     _model()
     path = _stored(tmp_path).with_name("noise.json")
-    assert noise_calibration.default_path() == path
+    assert noise.default_path() == path
     path.symlink_to(tmp_path / "target")
-    assert noise_calibration.default_path() is None
+    assert noise.default_path() is None
     shutil.rmtree(path.parent)

@@ -17,7 +17,7 @@ LIBRARY = (
 )
 # A door may import the library, and each of its folders those before it.
 DOORS = {
-    "ros1": ("ros1.transport", "ros1.component", "ros", "ros1.client", "ros1.afe", "ros1.bass", "ros1.localizer"),
+    "ros1": ("ros1.transport", "ros1.component", "ros1.client", "ros", "ros1.afe", "ros1.bass", "ros1.localizer"),
     "web": ("web.server", "web.genomix", "web.live"),
 }
 CLIENTS = {"ros1.transport", "ros1.component", "ros1.client"}  # the part of another door that `web` may import
@@ -25,7 +25,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     **{folder: set(LIBRARY[:number]) for number, folder in enumerate(LIBRARY)},
     **{folder: {*LIBRARY, *door[:number]} for door in DOORS.values() for number, folder in enumerate(door)},
     "eltclsh": set(LIBRARY),
-    "demo": {*LIBRARY, *DOORS["ros1"]},
 }
 for _folder in DOORS["web"]:
     MAY_IMPORT[_folder] |= CLIENTS

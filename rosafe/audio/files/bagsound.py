@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rosafe.audio.files.bagfile import BagError, BagReader, NotClosedError
-from rosafe.audio.files.windows import MAX_WINDOW, WindowStream, window_error
+from rosafe.audio.files.windows import MAX_WINDOW, WindowStream, mismatch, new_samples, window_error
 
 TYPE = "binaudio_portStruct"  # of the port Audio, in the package bass or another
 MD5SUM = "a3b73b6f3547870cf712571c1a85ea1d"
@@ -147,14 +147,15 @@ class Recording:
 
     def _numbered(self) -> Iterator[tuple[int, int, Piece]]:
         """Yield each piece with the number of its stream and the sample rate."""
-        count, stream = 0, WindowStream(with_first=True)
+        count, sample_rate, stream = 0, 0, WindowStream()
         for message in self._messages():
             problem = window_error(message)
             if problem:
                 raise BagSoundError(f"{self._path}: malformed message on {self.topic}: {problem}")
-            if stream.mismatch(message):
-                count, stream = count + 1, WindowStream(with_first=True)
-            yield count, message.sampleRate, stream.advance(message)
+            if sample_rate and mismatch(stream, sample_rate, message):
+                count, stream = count + 1, WindowStream()
+            sample_rate = message.sampleRate
+            yield count, sample_rate, new_samples(stream, message)
 
     def _messages(self) -> Iterator[_Message]:
         connections = {number for number, found in self._bag.connections.items() if found.topic == self.topic}

@@ -9,8 +9,8 @@ import numpy as np
 
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization.direction_model import DirectionModel
-from rosafe.ros1.localizer.frame_listener import FrameListener, ear_levels
-from rosafe.ros1.localizer.frame_source import NewFrames
+from rosafe.localization.live import NewFrames
+from rosafe.ros1.localizer.measurement import FrameListener, ear_levels
 
 DIRECTIONS = ("left", "ahead", "right")
 QUIET_SECONDS = 2.0  # of quiet, at the beginning

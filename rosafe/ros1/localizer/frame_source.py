@@ -5,87 +5,23 @@ from __future__ import annotations
 import functools
 import struct
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import rospy
 
-from rosafe.audio.files.windows import MAX_INDEX, new_frames
+from rosafe.audio.files.windows import MAX_INDEX, WindowStream
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface import LAYOUTS
 from rosafe.localization import cues
+from rosafe.localization.live import FrameFormat, NewFrames, StreamRestartedError
 from rosafe.ros import FrameClock
 from rosafe.ros1.component import serialization
 
 READ_BYTES = 2**17  # per read of a subscriber
 KEPT_MESSAGES = 8  # of each port, until the other ports have the same block
 _HEAD = struct.Struct("<IQQ")  # the beginning of a message: sampleRate, lastFrameIndex, framesOnPort
-
-
-@dataclass(frozen=True)
-class FrameFormat:
-    """The frames of the ports: sizes in samples.
-
-    Attributes
-    ----------
-    sample_rate : float
-        Hz.
-    channels : int
-        Number of channels.
-    window, hop, block : int
-        Length and distance of frames, and the block of the input, in samples.
-    """
-
-    sample_rate: float
-    channels: int
-    window: int
-    hop: int
-    block: int
-
-    @property
-    def rest(self) -> float:
-        """Samples after the newest frame of a message: exact if the hop divides the block, otherwise an estimate."""
-        return -self.window % self.hop if self.block % self.hop == 0 else self.hop / 2
-
-
-@dataclass(frozen=True)
-class NewFrames:
-    """Successive frames of all representations.
-
-    Attributes
-    ----------
-    features : mapping
-        As for `Localizer.update`.
-    middles : ndarray, (F,)
-        The clock time of the middle of each frame, s.
-    lost : int
-        Number of frames that are missing before them.
-    """
-
-    features: Mapping[str, FloatArray]
-    middles: FloatArray
-    lost: int
-
-    def select(self, frames: Any) -> NewFrames:
-        """Return some of the frames: a slice, or an array of bool."""
-        features = {kind: array[..., frames] for kind, array in self.features.items()}
-        return NewFrames(features, self.middles[frames], 0)
-
-    @staticmethod
-    def joined(parts: Sequence[NewFrames]) -> NewFrames:
-        """Return all frames of `parts`."""
-        if len(parts) == 1:
-            return parts[0]
-        features = {
-            kind: np.concatenate([part.features[kind] for part in parts], axis=-1) for kind in parts[0].features
-        }
-        return NewFrames(features, np.concatenate([part.middles for part in parts]), 0)
-
-
-class StreamRestartedError(Exception):
-    """The index of the stream has fallen; the text says from where to where."""
 
 
 class _Undecoded:
@@ -107,12 +43,12 @@ def _message_class(idl: str) -> Any:
 class _Port:
     """The messages of one port. All methods but `close` need the lock of the source."""
 
-    def __init__(self, topic: str, kind: str, format_: FrameFormat, source: FrameSource) -> None:
+    def __init__(self, topic: str, kind: str, format_: FrameFormat, source: PortSource) -> None:
         self.kind = kind
         self.problem = ""
         self.messages: dict[int, Any] = {}  # the newest, by lastFrameIndex
         self.window = 0  # samples for which the newest message has frames
-        self.count = 0  # frames from the first block that was used to the end of the last one
+        self.stream = WindowStream(format_.hop, format_.window)  # of the blocks that were used
         self._format = format_
         self._source = source
         self._newest = 0
@@ -169,32 +105,26 @@ class _Port:
                 return f"{self.kind}: expected {self._format.channels} channels, got an array of shape {shape}"
         return ""
 
-    def advance(self, index: int, before: int, first: int) -> None:
-        """Use the block up to `index`, after the one up to `before`; the first one was up to `first`."""
-        message, used, hop = self.messages[index], self._used, self._format.hop
+    def advance(self, index: int) -> None:
+        """Use the block up to `index`."""
+        self._used = self.messages[index]
         self.messages = {other: kept for other, kept in self.messages.items() if other > index}
-        self._used = message
-        least = (index - first) // hop
-        if (index - first) % hop == 0:
-            self.count = least
-        else:
-            count = self.count + new_frames((index - before) / hop, message.left, used.left)
-            self.count = min(max(count, least), least + 1)  # windows of silence are all equal
+        self.stream.advance(index - 1, self._used.left)
 
     @property
     def first(self) -> int:
-        """The number of frames before the window of the block that was used last."""
-        return self.count - int(self._used.framesOnPort)
+        """Number of the first frame of the block that was used last."""
+        return self.stream.frames - int(self._used.framesOnPort)
 
     def frames(self, begin: int, end: int) -> FloatArray:
-        """Return the frames from `begin` to `end`, counted as `count`."""
+        """Return the frames with the numbers from `begin` to `end`."""
         columns = slice(begin - self.first, end - self.first)
         if self.kind == "ratemap":
             return np.stack((self._used.left[:, columns], self._used.right[:, columns]))
         return np.asarray(self._used.left[:, columns])
 
 
-class FrameSource:
+class PortSource:
     """New frames of the representations, from rospy's threads to the one that localizes.
 
     Parameters
@@ -223,8 +153,7 @@ class FrameSource:
         self.lock = threading.Lock()
         self._clock = clock
         self._index = 0  # block that was used last
-        self._first = 0  # first block that was used
-        self._done = 0  # frames that were taken
+        self._done = 0  # number of the frame after those that were taken
         self._end = 0.0  # last sample of frame 0, which is before the first that is taken
         with self.lock:  # messages wait for the last port
             self._ports = [_Port(topics[kind], kind, format_, self) for kind in cues.KINDS]
@@ -279,17 +208,18 @@ class FrameSource:
                 return None
             before, self._index = self._index, newest
             restarted = self._index < before
-            if not before or restarted:
-                self._first, self._done, self._end = self._index, 0, self._index - 1 - self.format.rest
             for port in self._ports:
-                port.advance(self._index, before, self._first)
+                port.advance(self._index)
+            if not before or restarted:
+                self._done = self._ports[0].stream.frames
+                self._end = self._index - 1 - self.format.rest - self._done * self.format.hop
             if restarted:
                 raise StreamRestartedError(f"the frame index fell from {before} to {self._index}")
             return self._new()
 
     def _new(self) -> NewFrames | None:
         first = max(self._done, *(port.first for port in self._ports))
-        end = min(port.count for port in self._ports)
+        end = min(port.stream.frames for port in self._ports)
         if end <= first:
             return None
         lost, self._done = first - self._done, end

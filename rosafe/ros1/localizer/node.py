@@ -9,22 +9,22 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import rospy
+from std_msgs.msg import Bool
 
 from rosafe.declarations.errors import ComponentError
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.head import Head
+from rosafe.localization.live import OK, FixedHead, FrameQueue, LocalizationLoop, Mute, TransformedHead
 from rosafe.localization.localizer import SPHERE, Localizer, find_model
 from rosafe.ros import FrameClock
 from rosafe.ros1.component.state_publisher import Diagnostics
-from rosafe.ros1.localizer.frame_queue import FrameQueue
-from rosafe.ros1.localizer.head_rotation import FixedHead, HeadRotation, TransformedHead
-from rosafe.ros1.localizer.localization_loop import LocalizationLoop
-from rosafe.ros1.localizer.mute import Mute
-from rosafe.ros1.localizer.noise_calibration import StoredNoise
+from rosafe.ros1.localizer.frame_source import PortSource
+from rosafe.ros1.localizer.noise import StoredNoise
 from rosafe.ros1.localizer.publishers import Publishers
 from rosafe.ros1.localizer.settings import LocalizerSettings, read_settings
-from rosafe.ros1.localizer.status import OK, NodeStatus
-from rosafe.ros1.localizer.tree_link import TreeLink
+from rosafe.ros1.localizer.status import NodeStatus
+from rosafe.ros1.localizer.transforms import TransformBuffer
+from rosafe.ros1.localizer.tree_link import LocalizerPorts, TreeLink
 from rosafe.ros1.transport import registration
 from rosafe.system.terminal import printable
 
@@ -60,19 +60,22 @@ class LocalizerNode:
         self._diagnostics.add("localization", self._status.report)
         self._models.report = self._report_learning
         afe = rospy.resolve_name(settings.rosafe)
-        self._rotation = _head_rotation(settings, self._status)
-        self._mute = Mute(settings.audio_delay, self._status)
+        self._transforms = _transforms(settings)
+        mute = Mute(settings.audio_delay, self._status, rospy.get_time)
+        self._mute = rospy.Subscriber("~mute", Bool, lambda m: mute.set(m.data), queue_size=10, tcp_nodelay=True)
         self._clock = FrameClock(afe)
+        names = settings.world_frame, settings.head_frame, settings.audio_delay
+        head = FixedHead() if self._transforms is None else TransformedHead(self._transforms, *names, self._status)
         self._loop = LocalizationLoop(
             functools.partial(_localizer, settings.seconds, noise),
             Publishers(settings.frame_id),
-            self._clock,
-            FrameQueue(self._rotation, self._mute),
+            FrameQueue(head, mute),
             self._status,
             lambda: self._link.check_now(),
+            rospy.get_time,
         )
         self._link = TreeLink(
-            afe, settings.connect, self._models.model_for, self._loop.connect, self._status, self._loop.is_stalled
+            afe, settings.connect, self._models.model_for, self._connect, self._status, self._loop.is_stalled
         )
         registration.registrar().settle(UP_SECONDS)
         self._loop.start()
@@ -86,8 +89,15 @@ class LocalizerNode:
             self._diagnostics.changed()
             self._link.close()
             self._loop.close()
-            self._rotation.close()
-            self._mute.close()
+            if self._transforms is not None:
+                self._transforms.close()
+            self._mute.unregister()
+
+    def _connect(self, ports: LocalizerPorts | None) -> None:
+        if ports is None:
+            self._loop.connect(None)
+        else:
+            self._loop.connect(ports.model, functools.partial(PortSource, ports.topics, ports.format, self._clock))
 
     def _report_learning(self, part: float) -> None:
         """Show the progress of learning in the log and in /diagnostics; raises InterruptedError if the node ends."""
@@ -103,18 +113,19 @@ def _localizer(seconds: float, noise: StoredNoise, model: DirectionModel) -> Loc
     return localizer
 
 
-def _head_rotation(settings: LocalizerSettings, status: NodeStatus) -> HeadRotation:
+def _transforms(settings: LocalizerSettings) -> TransformBuffer | None:
+    """Return the transforms of the head, subscribed; None if azimuths are relative to it."""
     if not settings.world_frame:
-        return FixedHead()
+        return None
     try:
-        head = TransformedHead(settings.world_frame, settings.head_frame, settings.audio_delay, status)
+        transforms = TransformBuffer(settings.world_frame, settings.head_frame)
+        transforms.subscribe()
     except ImportError as problem:
         raise ComponentError(
             "::localizer::e_badNewValue",
             f"world_frame: expected the Python modules of tf2 ({problem}); run scripts/install",
         ) from None
-    head.subscribe()
-    return head
+    return transforms
 
 
 class Models:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import rospy
 
-from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization.tracker import FORGOTTEN, PRESENT, Track
 from rosafe.ros1.transport.publisher import NewestMessage, Publisher
 
@@ -91,8 +90,3 @@ class Publishers:
 def ros_time(seconds: float) -> rospy.Time:
     """Return a time in s as a time of ROS."""
     return rospy.Time.from_sec(max(0.0, seconds))
-
-
-def uniform(azimuths: FloatArray) -> FloatArray:
-    """Return the posterior without evidence."""
-    return np.full(len(azimuths), 1 / len(azimuths))

@@ -8,13 +8,12 @@ from collections.abc import Callable
 from typing import Any
 
 import rospy
-from diagnostic_msgs.msg import DiagnosticStatus
 
+from rosafe.localization.live import ERROR, OK, WARN
 from rosafe.ros1.transport.log_throttle import ThrottledLog
 from rosafe.system.terminal import printable
 
 LOG_SECONDS = 10.0  # in which problems that differ only in numbers are logged once
-OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
 class NodeStatus:
@@ -63,6 +62,10 @@ class NodeStatus:
         self.count("unexpected errors", 1)
         text = f"unexpected error, the node tries again: {type(problem).__name__}: {printable(str(problem))}"
         self.set(part, ERROR, text, log=new)
+
+    def warn(self, line: str, kind: str) -> None:
+        """Write a line of a kind to the log, once in some seconds."""
+        self._log[WARN](line, kind)
 
     def clear(self, part: str) -> None:
         """Remove the state of a part."""

@@ -41,6 +41,21 @@ class TransformBuffer:
         self._parents: dict[str, str] = {}
         self._names = self._relevant = {world, head}
         self._latest: dict[str, rospy.Time] = {}  # the newest stamp of each relevant frame
+        self._subscribers: list[rospy.Subscriber] = []
+
+    def subscribe(self) -> None:
+        """Subscribe to /tf and /tf_static."""
+        from tf2_msgs.msg import TFMessage
+
+        self._subscribers = [
+            rospy.Subscriber("/tf", TFMessage, self.add, callback_args=False, queue_size=100, tcp_nodelay=True),
+            rospy.Subscriber("/tf_static", TFMessage, self.add, callback_args=True, queue_size=100),
+        ]
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        for subscriber in self._subscribers:
+            subscriber.unregister()
 
     def clear(self) -> None:
         """Forget all transforms except the static ones."""

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import os
 import threading
+import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -21,13 +22,12 @@ from rosafe.dsp.framing import FrameGrid
 from rosafe.interface import BLOCK_AND_BUFFERS, REQUEST, ROSAFE, ComponentError, format_value
 from rosafe.localization import cues
 from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.live import OK, WARN, FrameFormat
 from rosafe.ros1.client.component_client import ComponentClient
 from rosafe.ros1.client.graph import Graph, NotRegisteredError
 from rosafe.ros1.client.tcpros import ServiceClient, component_exception
 from rosafe.ros1.localizer.created_processors import CreatedProcessors
-from rosafe.ros1.localizer.frame_source import FrameFormat
-from rosafe.ros1.localizer.sound_probe import sound_rate
-from rosafe.ros1.localizer.status import OK, WARN, NodeStatus
+from rosafe.ros1.localizer.status import NodeStatus
 from rosafe.ros1.transport import registration
 from rosafe.ros1.transport.log_throttle import ThrottledLog
 from rosafe.system.terminal import printable
@@ -35,6 +35,7 @@ from rosafe.tree.tree_planner import ExistingProcessor
 
 BLOCK_SECONDS = 0.05  # block of a new input, rounded to a multiple of the hop: 2205 frames at 44.1 kHz
 POLL_SECONDS = 1.0  # between two checks of the processors, and between two attempts
+PROBE_SECONDS = 0.05  # between two looks for a message of sound
 SOUND_SECONDS = 1.0  # for two messages of the sound
 CALL_SECONDS = 30.0
 MAX_PAUSE = 16.0  # s between two requests that fail
@@ -45,7 +46,7 @@ _report = ThrottledLog(rospy.logwarn, 60.0)
 
 
 @dataclass(frozen=True)
-class Link:
+class LocalizerPorts:
     """Representations that rosAFE computes.
 
     Attributes
@@ -79,7 +80,7 @@ class TreeLink:
     model_for : callable
         Called with the sample rate, on another thread; it may take long. Raises ValueError if the head has none.
     established : callable
-        Called with a `Link` when all representations are computed, and with None when they no longer are.
+        Called with a `LocalizerPorts` when all representations are computed, and with None when they no longer are.
     status : NodeStatus
         Reports missing parts.
     is_stalled : callable
@@ -91,7 +92,7 @@ class TreeLink:
         instance: str,
         connect: str,
         model_for: Callable[[float], DirectionModel],
-        established: Callable[[Link | None], None],
+        established: Callable[[LocalizerPorts | None], None],
         status: NodeStatus,
         is_stalled: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -202,7 +203,7 @@ class TreeLink:
         if processors := await client.processors():  # otherwise a tree may still be restored
             await self._created.keep(graph, (processor.name for processor in processors))
 
-    async def _establish(self, graph: Graph, client: ComponentClient) -> Link:
+    async def _establish(self, graph: Graph, client: ComponentClient) -> LocalizerPorts:
         service = ServiceClient(graph, ROSAFE.name, self._instance, "request")
         try:
             model = await self._model_of_input(graph, service, client)
@@ -225,7 +226,7 @@ class TreeLink:
         block = int(root.values["nFramesPerBlock"])
         grid = FrameGrid.design(rate, "cc", model.parameters)
         _report_block(self._status, block, grid.hop, rate)
-        return Link(model, FrameFormat(rate, model.channels, len(grid.window), grid.hop, block), topics)
+        return LocalizerPorts(model, FrameFormat(rate, model.channels, len(grid.window), grid.hop, block), topics)
 
     async def _model_of_input(self, graph: Graph, service: ServiceClient, client: ComponentClient) -> DirectionModel:
         """Return the model for the input, which is created if there is none, or if the rate of the sound differs."""
@@ -335,3 +336,20 @@ def _report_block(status: NodeStatus, block: int, hop: int, rate: float) -> None
 def _reason(problem: ComponentError) -> str:
     what = problem.what or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
     return printable(f"waiting for rosAFE: {problem.ex}: {what}")
+
+
+async def sound_rate(topic: str, seconds: float) -> int:
+    """Return the sample rate (Hz) of the sound on a topic (`binaudio_portStruct`); 0 if there is none within a time."""
+    rates: list[int] = []  # of messages: the first one may be an old one of a latched topic
+
+    def received(message: Any) -> None:
+        rates.append(int.from_bytes(message._buff[:4], "little"))  # the message begins with it
+
+    subscriber = rospy.Subscriber(topic, rospy.AnyMsg, received, queue_size=1)
+    try:
+        until = time.monotonic() + seconds
+        while len(rates) < 2 and time.monotonic() < until:
+            await asyncio.sleep(PROBE_SECONDS)
+    finally:
+        subscriber.unregister()
+    return rates[-1] if len(rates) > 1 else 0

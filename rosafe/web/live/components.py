@@ -13,8 +13,8 @@ from rosafe.interface import BASS, KINDS, LOAD_SETUP, REQUEST, ROSAFE, SAVE_SETU
 from rosafe.ros1.client.component_client import ComponentClient
 from rosafe.ros1.client.description import describe_parameter
 from rosafe.ros1.client.graph import Graph
+from rosafe.ros1.client.tree_snapshot import TreeSnapshot
 from rosafe.tree import tree_planner
-from rosafe.web.live.plot_data import ProcessorInfo, TreeSnapshot
 
 Action = Callable[[Mapping[str, Any]], Awaitable[dict[str, Any]]]
 
@@ -46,7 +46,7 @@ class ComponentFacade:
         """Return the processors; raise ComponentError if rosAFE does not answer."""
         try:
             answer = await asyncio.wait_for(self._rosafe.outputs("getProcessors", {}), TREE_TIMEOUT_SECONDS)
-            return TreeSnapshot([ProcessorInfo.of(processor) for processor in answer["processors"]])
+            return TreeSnapshot.of(answer["processors"])
         except TimeoutError:
             raise ComponentError("::genom::mwerr", what=f"{self._rosafe.instance} does not answer") from None
         except ValueError as problem:

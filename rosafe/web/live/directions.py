@@ -11,7 +11,7 @@ import numpy as np
 import rospy
 
 from rosafe.localization import angles
-from rosafe.web.live.ports import Audio
+from rosafe.web.live.audio import Audio
 
 RATE = 10.0  # columns per second, as the localizer publishes
 MAX_SOURCES = 8  # of the localizer, and of a scene

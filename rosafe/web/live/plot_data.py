@@ -2,101 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from rosafe.audio.files.windows import MAX_RATE
-from rosafe.interface import KINDS, LAYOUTS, Representation
+from rosafe.interface import KINDS
+from rosafe.ros1.client.tree_snapshot import ProcessorInfo, TreeSnapshot
 
 MAX_COLUMN_RATE = 100.0  # columns per second
 MAX_ROWS = 128  # of an ear: more than the screen shows
 FLOOR_POWER = 1e-20  # the lowest level: -200 dB
-MAX_SIZE = 2**20  # of an axis
-
-
-@dataclass(frozen=True)
-class ProcessorInfo:
-    """A processor as listed by getProcessors; the values of its parameters are texts."""
-
-    name: str
-    kind: str
-    parent: str
-    topic: str
-    rate: float  # of its frames, Hz
-    shape: tuple[int, ...]
-    values: Mapping[str, str] = field(hash=False)
-
-    @classmethod
-    def of(cls, info: Mapping[str, Any]) -> ProcessorInfo:
-        """Return a processor from the struct of getProcessors; raise ValueError if its rate or shape is not valid."""
-        name, rate, shape = info["name"], info["rate"], info["shape"]
-        if not 0 <= rate <= MAX_RATE:
-            raise ValueError(f"{name}: expected a frame rate up to {MAX_RATE} Hz, got {rate}")
-        if max(shape, default=0) > MAX_SIZE:
-            raise ValueError(f"{name}: expected a shape of at most {MAX_SIZE} along an axis, got {max(shape)}")
-        values = {entry["name"]: entry["value"] for entry in info["parameters"]}
-        return cls(name, info["kind"], info["upperDepName"], info["topic"], float(rate), tuple(map(int, shape)), values)
-
-    def sizes(self, part: int) -> dict[str, int]:
-        """Return the sizes of the axes of a part except ear and time; getProcessors lists those of the largest part."""
-        parts = KINDS[self.kind].parts
-        largest = max(parts, key=lambda part: len(part.axes))
-        known = dict(zip([axis for axis in largest.axes if axis != "time"], self.shape, strict=False))
-        return {axis: known.get(axis, 1) for axis in parts[part].axes if axis not in ("ear", "time")}
-
-    def output_shape(self) -> dict[str, tuple[int, ...]]:
-        """Return the shape of one frame of each field of its messages. Of two axes, the second one is first."""
-        places = [place for place in LAYOUTS[self.kind].places if place.present]
-        sizes = [tuple(self.sizes(place.part).values()) for place in places]
-        return {place.field: (*size[1:], *size[:1]) for place, size in zip(places, sizes, strict=True)}
-
-
-class TreeSnapshot:
-    """The processors of a component, by name."""
-
-    def __init__(self, processors: Sequence[ProcessorInfo] = ()) -> None:
-        self.processors = {processor.name: processor for processor in processors}
-
-    @property
-    def sample_rate(self) -> float:
-        """Sample rate of the audio, Hz; 0 without an input."""
-        return next((p.rate for p in self.processors.values() if p.kind == "input"), 0.0)
-
-    def ancestors(self, processor: ProcessorInfo | None) -> Iterator[ProcessorInfo]:
-        """Yield the processor, its parent, and so on up to the input."""
-        while processor is not None:
-            yield processor
-            processor = self.processors.get(processor.parent)
-
-    def coordinates(self, processor: ProcessorInfo, axis: str, size: int) -> list[Any]:
-        """Return the coordinates along an axis (Hz, s or texts).
-
-        They are declared by the processor or by an ancestor; without a declaration, the result is empty.
-        """
-        unit = {"channel": "Hz", "filter": "Hz", "lag": "s"}.get(axis, "")
-        for ancestor in self.ancestors(processor):
-            kind = KINDS.get(ancestor.kind)
-            if kind is None:
-                break
-            for name in kind.coordinates:
-                values = _parse_list(kind, name, ancestor.values.get(name, ""))
-                if kind.units[name] == unit and len(values) == size:
-                    return values
-        return []
-
-
-def _parse_list(kind: Representation, name: str, text: str) -> list[Any]:
-    try:
-        return list(kind.parameter(name).parse(text))
-    except KeyError:  # a derived value: numbers, as written by text_of
-        return list(json.loads(text or "[]"))
-    except (ValueError, TypeError):
-        return []
 
 
 class PlotLayout:
@@ -114,6 +31,7 @@ class PlotLayout:
 
     Attributes
     ----------
+    part : int
     mode : str
         ``wave`` (two rows for each ear: minimum and maximum), ``line`` (one row for each ear) or ``heat``.
     group : int
@@ -128,8 +46,7 @@ class PlotLayout:
         kind = KINDS[processor.kind]
         if not 0 <= part < len(kind.parts):
             raise ValueError(f"{processor.name} has no part {part}")
-        self._processor, self._index, self._row = processor, part, row
-        self.fields = [place.field for place in LAYOUTS[kind.kind].places if place.part == part and place.present]
+        self._processor, self.part, self._row = processor, part, row
         self.ears = 2 if "ear" in kind.parts[part].axes else 1
         self.group = max(1, math.ceil(processor.rate / MAX_COLUMN_RATE - 1e-9))
         self.rate = processor.rate / self.group
@@ -167,12 +84,12 @@ class PlotLayout:
     def describe(self) -> dict[str, Any]:
         """Return the description of the plot for the page."""
         kind = KINDS[self._processor.kind]
-        part = kind.parts[self._index]
+        part = kind.parts[self.part]
         return {
             "name": self._processor.name,
             "kind": kind.kind,
             "doc": kind.doc,
-            "part": self._index,
+            "part": self.part,
             "partName": part.name,
             "mode": self.mode,
             "axis": self._axis,
@@ -193,9 +110,10 @@ class PlotLayout:
 
     # --- frames to columns ---
 
-    def columns(self, arrays: Sequence[np.ndarray]) -> np.ndarray:
-        """Return columns (size, n), float32, of the frames (..., n * group) of each field."""
-        return np.concatenate([self._reduce(array) for array in arrays]).astype(np.float32)
+    def columns(self, frames: np.ndarray) -> np.ndarray:
+        """Return columns (size, n), float32, of frames (..., n * group) with the axes of the part."""
+        ears = frames if self.ears == 2 else [frames]
+        return np.concatenate([self._reduce(ear) for ear in ears]).astype(np.float32)
 
     def _reduce(self, array: np.ndarray) -> np.ndarray:
         frames = array.shape[-1]
@@ -204,8 +122,8 @@ class PlotLayout:
             return np.stack((grouped.min(axis=1), grouped.max(axis=1)))
         if self.mode == "line":
             return array[self._row : self._row + 1, self.group - 1 :: self.group]
-        if array.ndim == 3:  # (lag or filter, channel, frame)
-            array = array.mean(axis=1) if self._row < 0 else array[:, self._row]
+        if array.ndim == 3:  # (channel, lag or filter, frame)
+            array = array.mean(axis=0) if self._row < 0 else array[self._row]
         if self.group > 1:
             grouped = array.reshape(len(array), frames // self.group, self.group)
             if self._decibels == 20.0:  # amplitudes: the level of the mean power in the column

@@ -14,12 +14,12 @@ from aiohttp import web
 
 from rosafe.interface import ComponentError
 from rosafe.ros1.client.asyncio_tools import run_shared
+from rosafe.ros1.client.tree_snapshot import TreeSnapshot
 from rosafe.system.version import VERSION
 from rosafe.web.live.access import HEADERS, TokenAuth
 from rosafe.web.live.client import BrowserConnection
 from rosafe.web.live.components import Action, ComponentFacade, catalogue, format_error
 from rosafe.web.live.health import Health
-from rosafe.web.live.plot_data import TreeSnapshot
 from rosafe.web.live.views import Hub
 from rosafe.web.server.connections import Connections, Limits
 from rosafe.web.server.listener import HttpListener, connection_of

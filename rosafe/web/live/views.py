@@ -16,12 +16,15 @@ import numpy as np
 from rosafe.audio.files.levels import LevelMeter
 from rosafe.interface import KINDS
 from rosafe.ros1.client.errors import too_many
+from rosafe.ros1.client.port_reader import Frames, PortSubscription
+from rosafe.ros1.client.tree_snapshot import TreeSnapshot
 from rosafe.web.live import directions
-from rosafe.web.live.plot_data import MAX_COLUMN_RATE, PlotLayout, ProcessorInfo, TreeSnapshot, quantize
-from rosafe.web.live.ports import Audio, PortReader
+from rosafe.web.live.audio import Audio
+from rosafe.web.live.plot_data import MAX_COLUMN_RATE, PlotLayout, quantize
 
 HISTORY_SECONDS = 12.0  # sent to a page when it subscribes
 MAX_VIEWS = 256  # of all pages
+CHANGE_SECONDS = 3.0  # in which messages of a changed tree may arrive before the new tree is known
 
 QUANTISED, FLOAT = 0, 1
 MAX_COLUMN = 2**53  # the largest integer that JavaScript represents exactly
@@ -118,12 +121,26 @@ class View:
             return after, self._last_piece[1]
 
 
-class _SharedSubscription:
-    """A port and the views that use it."""
+class _Columns:
+    """Appends the frames of a port to a view as columns; frames of an incomplete column wait."""
 
-    def __init__(self, port: PortReader) -> None:
-        self.port = port
-        self.callbacks: dict[Key, Callable[[PortReader, Any], None]] = {}
+    def __init__(self, layout: PlotLayout, view: View, sample_rate: float) -> None:
+        self._layout, self._view, self._sample_rate = layout, view, sample_rate
+        self._rest: np.ndarray | None = None
+
+    def append(self, frames: Frames) -> None:
+        group, data = self._layout.group, frames.parts[self._layout.part]
+        if self._rest is not None and not frames.lost and not frames.restarted:
+            data = np.concatenate((self._rest, data), axis=-1)
+        first = frames.after - data.shape[-1]
+        start = -first % group
+        count = max(0, (data.shape[-1] - start) // group)
+        stop = start + count * group
+        self._rest = data[..., stop:] if count or not start else data
+        if count:
+            after = (first + stop) / frames.rate
+            end = frames.index / self._sample_rate - frames.after / frames.rate + after
+            self._view.append((first + start) // group, self._layout.columns(data[..., start:stop]), end)
 
 
 class Hub:
@@ -145,8 +162,7 @@ class Hub:
         self._directions: directions.DirectionTopics | None = None
         self._on_new_columns = on_new_columns
         self._views: dict[Key, View] = {}
-        self._subscriptions: dict[str, _SharedSubscription] = {}
-        self._topics: dict[Key, list[str]] = {}
+        self._ports: dict[Key, PortSubscription] = {}
         self._lock = threading.RLock()
         self._closed = False
 
@@ -192,13 +208,9 @@ class Hub:
         if key.what == "directions" and self._directions is not None:
             self._directions.close()
             self._directions = None
-        for topic in self._topics.pop(key, ()):
-            subscription = self._subscriptions[topic]
-            subscription.callbacks.pop(key, None)
-            if not subscription.callbacks:
-                subscription.port.close()
-                del self._subscriptions[topic]
-                self.latencies.pop(topic, None)
+        if (port := self._ports.pop(key, None)) is not None:
+            port.close()
+            self.latencies.pop(port.topic, None)
 
     def _begin(self, key: Key) -> None:
         if key.what == "levels":
@@ -225,27 +237,16 @@ class Hub:
         layout = PlotLayout(self.tree, processor, key.part, key.row)
         form = QUANTISED if layout.mode == "heat" else FLOAT
         self._views[key] = view = View(layout.size, layout.rate, form, layout.describe())
-        self._read_port(key, processor, partial(_append_columns, layout, view, self._on_new_columns))
+        use = partial(self._append_columns, processor.topic, _Columns(layout, view, self.tree.sample_rate))
+        self._ports[key] = PortSubscription(processor.topic, use, self.tree, grace_seconds=CHANGE_SECONDS)
 
-    def _read_port(self, key: Key, processor: ProcessorInfo, callback: Callable[[PortReader, Any], None]) -> None:
-        topic = processor.topic
-        if topic not in self._subscriptions:
-            port = PortReader(processor, processor.output_shape(), self.tree.sample_rate, self._dispatch)
-            self._subscriptions[topic] = _SharedSubscription(port)
-        self._subscriptions[topic].callbacks[key] = callback
-        self._topics.setdefault(key, []).append(topic)
-
-    def _dispatch(self, port: PortReader, message: Any) -> None:
-        with self._lock:  # the first message may arrive while the first callback is being added
-            subscription, audio = self._subscriptions.get(port.topic), self.audio
-            if subscription is None or subscription.port is not port:
-                return
-            callbacks = list(subscription.callbacks.values())
-        captured = audio.captured_at(port.index) if audio is not None else None
+    def _append_columns(self, topic: str, columns: _Columns, frames: Frames) -> None:
+        audio = self.audio
+        captured = audio.captured_at(frames.index) if audio is not None else None
         if captured is not None:
-            self.latencies[port.topic] = time.time() - captured
-        for callback in callbacks:
-            callback(port, message)
+            self.latencies[topic] = time.time() - captured
+        columns.append(frames)
+        self._on_new_columns()
 
     # --- changes of the tree ---
 
@@ -266,13 +267,13 @@ class Hub:
     def problems(self) -> dict[str, str]:
         """Why the latest messages were ignored, by topic."""
         audio = self.audio
-        topics = [*([audio] if audio else []), *(one.port for one in list(self._subscriptions.values()))]
+        topics = [*([audio] if audio else []), *list(self._ports.values())]
         return {one.topic: problem for one in topics if (problem := one.problem)}
 
     @property
     def lost(self) -> int:
         """Frames of ports that were not received."""
-        return sum(one.port.lost for one in list(self._subscriptions.values()))
+        return sum({port.topic: port.lost for port in list(self._ports.values())}.values())
 
 
 def _dependencies(key: Key, tree: TreeSnapshot) -> list[Any]:
@@ -280,27 +281,6 @@ def _dependencies(key: Key, tree: TreeSnapshot) -> list[Any]:
     processor = tree.processors.get(key.name)
     dependencies: list[Any] = [tree.sample_rate]
     return dependencies + [(ancestor, dict(ancestor.values)) for ancestor in tree.ancestors(processor)]
-
-
-def _append_columns(
-    layout: PlotLayout, view: View, on_new_columns: Callable[[], None], port: PortReader, message: Any
-) -> None:
-    """Append the new frames of a message to a view as columns."""
-    arrays = [getattr(message, field) for field in layout.fields]
-    frames = arrays[0].shape[-1]
-    group = layout.group
-    after = port.newest // group
-    # the first new column, or the first one of which the window has all frames
-    first = -(-(port.newest - port.fresh - (group - 1)) // group) if port.fresh < frames else 0
-    if view.next and 0 <= view.next <= after:
-        first = view.next
-    first = max(first, -(-(port.newest - frames) // group), 0)
-    if after <= first:
-        return
-    start = frames - (port.newest - first * group)
-    cut = [array[..., start : start + (after - first) * group] for array in arrays]
-    view.append(first, layout.columns(cut), port.end - (port.newest - after * group) / port.rate)
-    on_new_columns()
 
 
 def _append_levels(view: View, on_new_columns: Callable[[], None], samples: np.ndarray, end: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import threading
 import time
@@ -16,8 +17,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from rosafe.audio.files.windows import MAX_RATE
-from rosafe.ros1.component.audio import PAUSE_SECONDS, RING_SECONDS, AudioReader, AudioRing
-from tests.harness import PATIENCE
+from rosafe.ros1.component.audio import PAUSE_SECONDS, RING_SECONDS, AudioReader, AudioRing, Counters
+from tests.harness import PATIENCE, ROOT
 
 RATE = 8  # Hz: the ring contains 80 frames
 CAPACITY = int(RING_SECONDS * RATE)
@@ -465,3 +466,11 @@ def test_unobserved_blocks_are_read_when_the_sound_pauses(monkeypatch: pytest.Mo
     assert reader.waiting
     now += PAUSE_SECONDS
     assert not reader.waiting
+
+
+def test_the_counters_are_documented() -> None:
+    text = (ROOT / "docs" / "audio-stream.md").read_text("utf-8")
+    for counter in dataclasses.fields(Counters):
+        if counter.name not in ("messages", "last_loss"):
+            assert f"`{counter.name}`" in text, counter.name
+    assert f"a ring of {RING_SECONDS:g} s" in text

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import rosafe
+from rosafe.localization.live import OK
 from rosafe.localization.noise import FORMAT, NoiseCalibration
-from rosafe.ros1.localizer.noise_calibration import StoredNoise
-from rosafe.ros1.localizer.status import OK, NodeStatus
+from rosafe.ros1.localizer.noise import StoredNoise
+from rosafe.ros1.localizer.status import NodeStatus
 from tests.harness import Graph
 from tests.localization.conftest import RATE
 from tests.ros1.localizer.room import Room

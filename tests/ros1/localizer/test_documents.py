@@ -8,10 +8,9 @@ import re
 from std_msgs.msg import Bool
 
 from rosafe.commands import localize
+from rosafe.localization.live import AFTER_SECONDS, MAX_TILT, MAX_WAIT
 from rosafe.localization.noise import MARGIN_DB
 from rosafe.ros1.localizer.ear_check import QUIET_SECONDS
-from rosafe.ros1.localizer.head_rotation import MAX_TILT, MAX_WAIT
-from rosafe.ros1.localizer.mute import AFTER_SECONDS
 from rosafe.ros1.localizer.settings import LocalizerSettings
 from tests.harness import PYTHON, ROOT, Graph, wait_for
 

@@ -11,7 +11,7 @@ import pytest
 
 import rosafe
 from rosafe.localization.cues import PARAMETERS
-from rosafe.ros1.localizer import ear_check, frame_listener
+from rosafe.ros1.localizer import ear_check, measurement
 from rosafe.ros1.localizer.ear_check import DIRECTIONS, EarReport, HeardSound, assess, check_ears, heard_sound
 from rosafe.ros1.localizer.settings import LocalizerSettings
 from rosafe.ros1.transport import registration
@@ -120,12 +120,12 @@ def test_the_command(graph: Graph, sphere_model: Path, swapped: bool) -> None:
 
 def test_no_frames(graph: Graph, sphere_model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     graph.client()
-    monkeypatch.setattr(frame_listener, "SOUND_SECONDS", 1.0)
+    monkeypatch.setattr(measurement, "SOUND_SECONDS", 1.0)
     settings = LocalizerSettings(head=str(sphere_model), rosafe="missing")
     said: list[str] = []
     with (
-        frame_listener.FrameListener(settings) as listener,
-        pytest.raises(frame_listener.NoFramesError, match="no frames of rosAFE for 1 s: waiting for rosAFE"),
+        measurement.FrameListener(settings) as listener,
+        pytest.raises(measurement.NoFramesError, match="no frames of rosAFE for 1 s: waiting for rosAFE"),
     ):
         check_ears(listener, said.append)
     assert said == ["quiet, please: for 2 s"]
@@ -140,6 +140,6 @@ def test_a_sound_that_is_not_heard(
     monkeypatch.setattr(ear_check, "QUIET_SECONDS", 0.5)
     monkeypatch.setattr(ear_check, "WAIT_SECONDS", 1.0)
     said: list[str] = []
-    with Room(graph), frame_listener.FrameListener(LocalizerSettings(head=str(sphere_model))) as listener:
+    with Room(graph), measurement.FrameListener(LocalizerSettings(head=str(sphere_model))) as listener:
         assert check_ears(listener, said.append) is None
     assert said[-1].startswith("no sound was heard from the left of the head for 1 s")

@@ -7,14 +7,9 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-import rospy
-from std_msgs.msg import Bool
 
 from rosafe.dsp.numeric_limits import FloatArray
-from rosafe.ros1.localizer.frame_queue import FrameQueue
-from rosafe.ros1.localizer.frame_source import NewFrames
-from rosafe.ros1.localizer.head_rotation import FixedHead, Rotation
-from rosafe.ros1.localizer.mute import AFTER_SECONDS, Mute
+from rosafe.localization.live import AFTER_SECONDS, FixedHead, FrameQueue, Mute, NewFrames, Rotation
 from rosafe.ros1.localizer.status import NodeStatus
 
 
@@ -66,12 +61,9 @@ def test_frames_wait_for_others_and_for_their_rotation() -> None:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The ROS time, which the test sets."""
-    now = [100.0]
-    monkeypatch.setattr(rospy, "get_time", lambda: now[0])
-    monkeypatch.setattr(rospy, "Subscriber", lambda *_, **__: None)
-    return now
+def clock() -> list[float]:
+    """The clock time, which the test sets."""
+    return [100.0]
 
 
 def is_muted(mute: Mute, time: float) -> bool:
@@ -80,19 +72,19 @@ def is_muted(mute: Mute, time: float) -> bool:
 
 
 def test_a_mute_lasts_a_little_longer_and_delays_count(clock: list[float]) -> None:
-    mute = Mute(0.25, NodeStatus(lambda: None))
-    mute._receive(Bool(True))
+    mute = Mute(0.25, NodeStatus(lambda: None), lambda: clock[0])
+    mute.set(True)
     clock[0] = 105.0
-    mute._receive(Bool(False))
+    mute.set(False)
     end = 105.25 + AFTER_SECONDS
     assert mute.muted(np.array([100.2, 100.3, end - 0.05, end + 0.05])).tolist() == [False, True, True, False]
 
 
 def test_a_mute_has_ended_if_the_time_jumps_back(clock: list[float]) -> None:
-    mute = Mute(0.0, NodeStatus(lambda: None))
-    mute._receive(Bool(True))
+    mute = Mute(0.0, NodeStatus(lambda: None), lambda: clock[0])
+    mute.set(True)
     clock[0] = 105.0
-    mute._receive(Bool(False))
+    mute.set(False)
     assert is_muted(mute, 102.0)
     clock[0] = 1.0  # rosbag play in a loop
     assert not is_muted(mute, 0.9) and not is_muted(mute, 102.0)
@@ -100,11 +92,11 @@ def test_a_mute_has_ended_if_the_time_jumps_back(clock: list[float]) -> None:
 
 def test_a_mute_continues_if_the_time_jumps_back(clock: list[float]) -> None:
     status = NodeStatus(lambda: None)
-    mute = Mute(0.0, status)
-    mute._receive(Bool(True))
+    mute = Mute(0.0, status, lambda: clock[0])
+    mute.set(True)
     clock[0] = 1.0
     assert is_muted(mute, 1.0) and is_muted(mute, 2.0)
     clock[0] = 0.0  # and at once again, before anything has asked
-    mute._receive(Bool(False))
+    mute.set(False)
     clock[0] = 0.5
     assert not is_muted(mute, 0.5) and status._values["muted"] == "no" and "muted" not in status.state()[1]

@@ -13,9 +13,10 @@ import pytest
 import rospy
 
 from rosafe.localization import cues
+from rosafe.localization.live import FrameFormat, StreamRestartedError
 from rosafe.ros import FrameClock, array_msg
 from rosafe.ros1.localizer import frame_source
-from rosafe.ros1.localizer.frame_source import FrameFormat, FrameSource, StreamRestartedError
+from rosafe.ros1.localizer.frame_source import PortSource
 from tests.harness import Graph, private_graph, wait_for
 from tests.ros1.localizer.conftest import RATE
 from tests.ros1.localizer.session import running_localizer, scene_file, watched, watcher
@@ -32,7 +33,7 @@ def test_repeated_messages_have_no_new_frames(graph: Graph) -> None:
     )
     graph.client()
     format_ = FrameFormat(16000.0, CHANNELS, 2 * HOP, HOP, 5 * HOP)
-    source = FrameSource(topics, format_, cast(FrameClock, clock), lambda: None)
+    source = PortSource(topics, format_, cast(FrameClock, clock), lambda: None)
     publishers = [rospy.Publisher(topic, message_class, queue_size=10) for topic in topics.values()]
 
     def publish(index: int) -> Any:

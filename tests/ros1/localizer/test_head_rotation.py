@@ -13,9 +13,10 @@ from geometry_msgs.msg import TransformStamped
 from tf2_msgs.msg import TFMessage
 
 from rosafe.localization import angles
+from rosafe.localization.live import MAX_WAIT, OK, WARN, TransformedHead
 from rosafe.ros1.localizer import transforms
-from rosafe.ros1.localizer.head_rotation import MAX_WAIT, TransformedHead
-from rosafe.ros1.localizer.status import OK, WARN, NodeStatus
+from rosafe.ros1.localizer.status import NodeStatus
+from rosafe.ros1.localizer.transforms import TransformBuffer
 from tests.harness import Graph, wait_for
 from tests.localization.conftest import KEMAR, RATE
 
@@ -42,11 +43,12 @@ class Head:
 
     def __init__(self, delay: float = 0.0) -> None:
         self.status = NodeStatus(lambda: None)
-        self.head = TransformedHead("world", "head", delay, self.status)
+        self.transforms = TransformBuffer("world", "head")
+        self.head = TransformedHead(self.transforms, "world", "head", delay, self.status)
 
     def tf(self, *found: TransformStamped, static: bool = False) -> None:
         """Receive a message."""
-        self.head.transforms.add(TFMessage(list(found)), static)
+        self.transforms.add(TFMessage(list(found)), static)
 
     def turn(self, seconds: float, speed: float, begin: float = START) -> None:
         """Receive transforms of a head that turns, 20 in each second."""
@@ -63,7 +65,7 @@ class Head:
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The time of `time.monotonic` in the module, which the test sets."""
     now = [50.0]
-    monkeypatch.setattr("rosafe.ros1.localizer.head_rotation.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("rosafe.localization.live.time.monotonic", lambda: now[0])
     return now
 
 
@@ -169,8 +171,8 @@ def test_unsuitable_transforms_are_ignored(monkeypatch: pytest.MonkeyPatch, capf
         head.tf(transform("world", f"frame{number}", START), transform(f"frame{number}", "moved", START), static=True)
     head.tf(transform("head", "world", START))  # a loop: tf2 finds no rotation, but the node does not fail
     head.head.lookup(np.array([START + 0.2]))
-    assert len(head.head.transforms._parents) <= 10
-    assert head.head.transforms._buffer.all_frames_as_string().count("Frame") <= 12
+    assert len(head.transforms._parents) <= 10
+    assert head.transforms._buffer.all_frames_as_string().count("Frame") <= 12
     assert "TF_" not in capfd.readouterr().err
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,17 +13,13 @@ import numpy as np
 import pytest
 import rospy
 
-from rosafe.localization import cues
+from rosafe.localization import cues, live
 from rosafe.localization.head import Head
+from rosafe.localization.live import OK, FixedHead, FrameFormat, FrameQueue, LocalizationLoop
 from rosafe.localization.localizer import Localizer
 from rosafe.processing.stream import Stream
-from rosafe.ros1.localizer import frame_queue, localization_loop
-from rosafe.ros1.localizer.frame_queue import FrameQueue
-from rosafe.ros1.localizer.frame_source import _HEAD, FrameFormat
-from rosafe.ros1.localizer.head_rotation import FixedHead
-from rosafe.ros1.localizer.localization_loop import LocalizationLoop
-from rosafe.ros1.localizer.status import OK, NodeStatus
-from rosafe.ros1.localizer.tree_link import Link
+from rosafe.ros1.localizer.frame_source import _HEAD, PortSource
+from rosafe.ros1.localizer.status import NodeStatus
 from tests.localization.conftest import RATE, modulated
 
 BLOCK = RATE  # 1 s
@@ -37,10 +34,8 @@ class Robot:
         self.index = 0
         self.published: list[tuple[float, list[float]]] = []  # stamp and azimuths of present sources
         clock: Any = SimpleNamespace(monotonic=lambda: self.index / RATE)
-        for module in (localization_loop, frame_queue):
-            monkeypatch.setattr(module, "time", clock)
+        monkeypatch.setattr(live, "time", clock)
         monkeypatch.setattr(rospy, "Subscriber", lambda *_, **__: SimpleNamespace(unregister=lambda: None))
-        monkeypatch.setattr(rospy, "get_time", lambda: START + self.index / RATE)
         frame_clock: Any = SimpleNamespace(
             covers=lambda *_: True,
             problem="",
@@ -53,15 +48,16 @@ class Robot:
         self.loop = LocalizationLoop(
             lambda model: Localizer(RATE, model, keep_history=False),
             publishers,
-            frame_clock,
             FrameQueue(FixedHead(), mute),
             self.status,
             lambda: None,
+            lambda: START + self.index / RATE,
         )
         model = Localizer(RATE, str(head)).model
         window, hop = (round(model.parameters[f"cc_{name}"] * RATE) for name in ("wSizeSec", "hSizeSec"))
         frame_format = FrameFormat(RATE, model.channels, window, hop, BLOCK)
-        self.loop.connect(Link(model, frame_format, dict.fromkeys(cues.KINDS, "")))
+        topics = dict.fromkeys(cues.KINDS, "")
+        self.loop.connect(model, partial(PortSource, topics, frame_format, frame_clock))
         self._stream = Stream(RATE, model.parameters, list(cues.KINDS))
 
     def _publish(self, time: float, tracks: Any, *_: Any) -> None:
@@ -77,7 +73,7 @@ class Robot:
         """Deliver the representations of a block, and let the loop do what its thread does."""
         self.index += BLOCK
         source = self.loop._source
-        assert source is not None
+        assert isinstance(source, PortSource)
         for port in source._ports:
             found = features[port.kind]
             left, right = found if found.ndim == 3 else (found, None)

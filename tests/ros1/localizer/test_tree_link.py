@@ -8,9 +8,10 @@ from typing import Any, ClassVar
 
 import pytest
 
+from rosafe.localization.live import WARN
 from rosafe.ros1.client.graph import NotRegisteredError
 from rosafe.ros1.localizer import tree_link
-from rosafe.ros1.localizer.status import WARN, NodeStatus
+from rosafe.ros1.localizer.status import NodeStatus
 from tests.harness import wait_for
 
 

@@ -12,12 +12,9 @@ import numpy as np
 import pytest
 import rospy
 
+from rosafe.localization.live import ERROR, OK, WARN, FixedHead, FrameQueue, LocalizationLoop, NewFrames
 from rosafe.ros1.localizer import tree_link
-from rosafe.ros1.localizer.frame_queue import FrameQueue
-from rosafe.ros1.localizer.frame_source import NewFrames
-from rosafe.ros1.localizer.head_rotation import FixedHead
-from rosafe.ros1.localizer.localization_loop import LocalizationLoop
-from rosafe.ros1.localizer.status import ERROR, OK, WARN, NodeStatus
+from rosafe.ros1.localizer.status import NodeStatus
 from tests.harness import wait_for
 
 
@@ -92,7 +89,7 @@ class Fake:
         publishers = namespace(begin_again=lambda: None, publish=self.publish)
         unused: Any = None
         queue = FrameQueue(FixedHead(), mute)
-        self.loop = LocalizationLoop(unused, publishers, unused, queue, self.status, unused)
+        self.loop = LocalizationLoop(unused, publishers, queue, self.status, unused, lambda: 1.0)
         self.loop._localizer, self.loop._source = self.localizer, self.source
 
     def fail(self, step: str) -> None:

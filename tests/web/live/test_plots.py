@@ -10,11 +10,13 @@ import pytest
 import rospy
 
 from rosafe.interface import KINDS, format_value
+from rosafe.ros1.client.port_reader import Frames
+from rosafe.ros1.client.tree_snapshot import ProcessorInfo, TreeSnapshot
 from rosafe.web.live import image_topics
 from rosafe.web.live.client import BrowserConnection
-from rosafe.web.live.plot_data import PlotLayout, ProcessorInfo, TreeSnapshot, quantize
+from rosafe.web.live.plot_data import PlotLayout, quantize
 from rosafe.web.live.subscriptions import parse_keys
-from rosafe.web.live.views import FLOAT, PIECE, QUANTISED, Hub, Key, View
+from rosafe.web.live.views import FLOAT, PIECE, QUANTISED, Hub, Key, View, _Columns
 
 FREQUENCIES = [100.0, 200.0, 400.0]
 RNG = np.random.default_rng(3)
@@ -34,7 +36,7 @@ def test_a_ratemap_is_shown_in_decibels() -> None:
     one = processor("ratemap", 100, (2, 3), rm_scaling="power")
     layout = PlotLayout(tree(one), one, 0, -1)
     left, right = RNG.random((2, 3, 7))
-    assert np.allclose(layout.columns([left, right]), 10 * np.log10(np.concatenate([left, right])), atol=1e-4)
+    assert np.allclose(layout.columns(np.stack((left, right))), 10 * np.log10(np.concatenate([left, right])), atol=1e-4)
     description = layout.describe()
     assert (description["along"], description["rows"], description["ears"], description["unit"]) == (
         FREQUENCIES,
@@ -42,14 +44,16 @@ def test_a_ratemap_is_shown_in_decibels() -> None:
         2,
         "dB",
     )
-    silent = layout.columns([np.zeros((3, 1))] * 2)
+    silent = layout.columns(np.zeros((2, 3, 1)))
     assert np.allclose(silent, -200)
 
 
 def test_magnitudes_have_twice_the_decibels_of_powers() -> None:
     one = processor("ratemap", 100, (2, 3), rm_scaling="magnitude")
     values = RNG.random((3, 4))
-    assert np.allclose(PlotLayout(tree(one), one, 0, -1).columns([values] * 2)[:3], 20 * np.log10(values), atol=1e-4)
+    assert np.allclose(
+        PlotLayout(tree(one), one, 0, -1).columns(np.stack([values] * 2))[:3], 20 * np.log10(values), atol=1e-4
+    )
 
 
 def test_a_signal_is_shown_by_minimum_and_maximum() -> None:
@@ -57,7 +61,7 @@ def test_a_signal_is_shown_by_minimum_and_maximum() -> None:
     layout = PlotLayout(TreeSnapshot([one]), one, 0, -1)
     assert (layout.group, layout.rate) == (441, 100)
     sound = RNG.normal(size=(2, 4410))
-    columns = layout.columns(list(sound))
+    columns = layout.columns(sound)
     for ear in range(2):
         assert np.allclose(columns[2 * ear], sound[ear].reshape(10, 441).min(axis=1), atol=1e-6)
         assert np.allclose(columns[2 * ear + 1], sound[ear].reshape(10, 441).max(axis=1), atol=1e-6)
@@ -74,7 +78,7 @@ def test_frames_are_grouped_so_that_a_plot_gets_at_most_100_columns_per_second(r
 def test_levels_of_a_filterbank_are_of_the_mean_power() -> None:
     one = processor("gammatone", 44100, (2, 3), fb_cfHz=format_value(FREQUENCIES))
     signal = RNG.normal(size=(3, 882))
-    columns = PlotLayout(TreeSnapshot([one]), one, 0, -1).columns([signal, signal])
+    columns = PlotLayout(TreeSnapshot([one]), one, 0, -1).columns(np.stack((signal, signal)))
     power = (signal.reshape(3, 2, 441) ** 2).mean(axis=2)
     assert np.allclose(columns[:3], 10 * np.log10(power), atol=1e-4)
 
@@ -84,9 +88,9 @@ def test_correlations_of_one_channel_or_the_mean_of_all(row: int) -> None:
     lags = [-1e-3, 0.0, 1e-3, 2e-3]
     one = processor("crossCorrelation", 100, (3, 4), cc_lags=format_value(lags))
     layout = PlotLayout(tree(one), one, 0, row)
-    curves = RNG.random((4, 3, 5))  # the order of the axes in messages
-    expected = curves.mean(axis=1) if row < 0 else curves[:, row]
-    assert np.allclose(layout.columns([curves]), expected, atol=1e-6)
+    curves = RNG.random((3, 4, 5))
+    expected = curves.mean(axis=0) if row < 0 else curves[row]
+    assert np.allclose(layout.columns(curves), expected, atol=1e-6)
     assert layout.describe()["along"] == lags and layout.describe()["choices"] == FREQUENCIES
 
 
@@ -95,7 +99,7 @@ def test_pitch_is_a_line_with_gaps() -> None:
     layout = PlotLayout(TreeSnapshot([one]), one, 0, 2)
     values = np.array([[1.0, np.nan], [3, 4], [5, 6]])
     assert layout.describe()["choices"] == ["pitch", "rawPitch", "confidence"]
-    assert np.array_equal(layout.columns([values, values + 1]), [[5, 6], [6, 7]])
+    assert np.array_equal(layout.columns(np.stack((values, values + 1))), [[5, 6], [6, 7]])
 
 
 def test_rows_are_averaged_if_there_are_many() -> None:
@@ -103,7 +107,9 @@ def test_rows_are_averaged_if_there_are_many() -> None:
     layout = PlotLayout(TreeSnapshot([one]), one, 0, -1)
     values = RNG.random((300, 2))
     assert layout.rows == 100
-    assert np.allclose(layout.columns([values, values])[:100], values.reshape(100, 3, 2).mean(axis=1), atol=1e-6)
+    assert np.allclose(
+        layout.columns(np.stack((values, values)))[:100], values.reshape(100, 3, 2).mean(axis=1), atol=1e-6
+    )
 
 
 def test_each_kind_can_be_plotted() -> None:
@@ -113,9 +119,8 @@ def test_each_kind_can_be_plotted() -> None:
         one = processor(kind, 100, tuple(sizes[axis] for axis in largest.axes if axis != "time"))
         for index, part in enumerate(representation.parts):
             layout = PlotLayout(TreeSnapshot([one]), one, index, -1)
-            rows = [sizes[axis] for axis in part.axes if axis not in ("ear", "time")]
-            array = np.ones((*rows[1:], *rows[:1], 4))  # the second axis is first
-            assert layout.columns([array] * layout.ears).shape == (layout.size, 4), (kind, part)
+            frames = np.ones((*(sizes[axis] for axis in part.axes if axis != "time"), 4))
+            assert layout.columns(frames).shape == (layout.size, 4), (kind, part)
 
 
 def test_the_quantization_error_is_at_most_half_a_step() -> None:
@@ -155,6 +160,29 @@ def test_a_view_keeps_the_last_seconds_and_marks_gaps() -> None:
     view.append(0, series[:, :7], 0.07)  # the audio has restarted
     after, head, columns = piece(view, 0)
     assert (after, head[3], head[1]) == (7, 0, 7)
+
+
+@pytest.mark.parametrize("rate", [100, 250, 1000])
+def test_each_frame_is_in_one_column(rate: int) -> None:
+    """Frames arrive in any number; those of an incomplete column wait, and those beside a loss are left out."""
+    one = processor("ratemap", rate, (2, 3), rm_scaling="power")
+    layout = PlotLayout(tree(one), one, 0, -1)
+    view = View(layout.size, layout.rate, FLOAT)
+    columns, group = _Columns(layout, view, 44100.0), layout.group
+    values = 10.0 ** RNG.random((2, 3, 700))
+    at = 5
+    for count in (1, 1, 2, 5, 7, 20, 40, 1, 100, 300):
+        lost = 31 if count == 40 else 0
+        at, data = at + lost + count, values[..., at + lost : at + lost + count]
+        columns.append(Frames(data, at - count, lost, False, None, "ratemap", (), rate, (data,), 441 * at))
+    first = -(-5 // group)
+    found = view.newest(at // group - first)
+    mean = values[..., : at // group * group].reshape(2, 3, -1, group).mean(axis=-1)
+    expected = 10 * np.log10(mean)[..., first:].reshape(6, -1)
+    gap = np.isnan(found[0])
+    assert 31 // group <= gap.sum() <= 31 // group + 2
+    np.testing.assert_allclose(found[:, ~gap], expected[:, ~gap], atol=1e-4)
+    assert view.end == pytest.approx(441 * at / 44100 - at % group / rate)
 
 
 def test_stride_and_maximum_of_columns() -> None:

@@ -13,7 +13,7 @@ import rosgraph.names
 import rospy
 
 from rosafe.audio.devices.base import Chunk, check_sample_rate, device_error
-from rosafe.audio.files.windows import MAX_WINDOW, WindowStream, window_error
+from rosafe.audio.files.windows import MAX_WINDOW, WindowStream, mismatch, new_samples, window_error
 from rosafe.interface import BASS, ComponentError
 from rosafe.ros1.component import serialization
 
@@ -57,6 +57,7 @@ class TopicSource:
         self.lost_frames = 0
         self._stopping = stopping
         self._stream = WindowStream(with_first=False)
+        self.sample_rate = 0  # Hz, of the first message
         # The first message; then (gap, samples, time) of each message, or the reason why the stream has ended.
         self._queue: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._put = self._taken = 0  # number of frames added to the queue and removed; each is counted by one thread
@@ -70,7 +71,6 @@ class TopicSource:
         self._subscriber = rospy.Subscriber(topic, message_class, self._receive, buff_size=2**24, tcp_nodelay=True)
         try:
             first = self._await_first(published is not None)
-            self.sample_rate = int(first.sampleRate)
             self.newest = int(first.lastFrameIndex)
             self.frames_per_chunk = min(max(1, int(first.nFramesPerChunk)), MAX_CHUNK)
             check_sample_rate(topic, sample_rate, self.sample_rate)
@@ -102,15 +102,16 @@ class TopicSource:
     def _receive(self, message: Any) -> None:
         if self._ended or message.problem or window_error(message):
             return  # the next window contains the same frames, or they count as lost
-        if self._stream.sample_rate == 0:
-            self._stream.advance(message)
+        if not self.sample_rate:
+            self.sample_rate = int(message.sampleRate)
+            new_samples(self._stream, message)
             self._queue.put(message)
-        elif why := self._stream.mismatch(message):
+        elif why := mismatch(self._stream, self.sample_rate, message):
             self._ended = True
             self._queue.put(f"{self.name}: a new stream begins ({why})")
         else:
             stamp = message.stamp["sec"] + message.stamp["nsec"] * 1e-9
-            gap, samples = self._stream.advance(message)
+            gap, samples = new_samples(self._stream, message)
             frames = samples.shape[1]
             if self._put - self._taken + frames > MAX_WAITING:
                 self._missed += gap + frames

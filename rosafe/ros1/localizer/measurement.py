@@ -1,4 +1,4 @@
-"""New frames of a running rosAFE for a command that measures for some seconds."""
+"""`rosafe localize --calibrate-noise`, and the new frames of a running rosAFE for this and for `--check`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import contextlib
 import queue
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import TracebackType
 
 import numpy as np
@@ -15,13 +16,18 @@ import rospy
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import cues
 from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.live import OK, NewFrames, StreamRestartedError
+from rosafe.localization.noise import NoiseCalibration, measured_level
 from rosafe.ros import FrameClock
-from rosafe.ros1.localizer.frame_source import FrameSource, NewFrames, StreamRestartedError
+from rosafe.ros1.localizer.frame_source import PortSource
 from rosafe.ros1.localizer.node import Models
 from rosafe.ros1.localizer.settings import LocalizerSettings
-from rosafe.ros1.localizer.status import OK, NodeStatus
-from rosafe.ros1.localizer.tree_link import Link, TreeLink
+from rosafe.ros1.localizer.status import NodeStatus
+from rosafe.ros1.localizer.tree_link import LocalizerPorts, TreeLink
+from rosafe.system.terminal import printable
 
+WAIT_SECONDS = 30.0  # that may pass, besides those of the noise, while frames are missing
+UNSTEADY_DB = 8.0  # of the loudest frames above the median
 SOUND_SECONDS = 30.0  # without frames, until an error
 _POLL_SECONDS = 0.5
 _QUEUED = 1000
@@ -52,7 +58,7 @@ class FrameListener:
         afe = rospy.resolve_name(settings.rosafe)
         self._clock = FrameClock(afe)
         self._lock = threading.Lock()  # of the source
-        self._source: FrameSource | None = None
+        self._source: PortSource | None = None
         self._model: DirectionModel | None = None
         self._frames: queue.Queue[tuple[DirectionModel, NewFrames]] = queue.Queue(_QUEUED)
         self._link = TreeLink(afe, settings.connect, models.model_for, self._connect, self._status)
@@ -70,8 +76,8 @@ class FrameListener:
     def _report_learning(self, part: float) -> None:
         self._status.set("rosAFE", OK, f"learning the directions of the head: {10 * int(10 * part)} %")
 
-    def _connect(self, link: Link | None) -> None:
-        source = FrameSource(link.topics, link.format, self._clock, self._received) if link is not None else None
+    def _connect(self, link: LocalizerPorts | None) -> None:
+        source = PortSource(link.topics, link.format, self._clock, self._received) if link is not None else None
         with self._lock:
             before, self._source = self._source, source
             self._model = link.model if link is not None else None
@@ -123,3 +129,34 @@ def ear_levels(model: DirectionModel, frames: NewFrames) -> FloatArray:
     """Return the level (F, 2) of the left and the right ear in dB full scale."""
     power = np.asarray(frames.features["ratemap"]).sum(axis=1).T
     return np.asarray(10 * np.log10(np.maximum(power, 1e-30)) + model.level_gain_db)
+
+
+def calibrate(listener: FrameListener, seconds: float, path: Path, say: Callable[[str], None]) -> NoiseCalibration:
+    """Measure the noise for `seconds`, and write its level to a file.
+
+    Raises
+    ------
+    NoFramesError
+        rosAFE computes no frames.
+    OutputError
+        The file cannot be written.
+    """
+    say(f"measuring the noise for {seconds:g} s: no other sounds, please")
+    parts: list[FloatArray] = []
+    hop, frames = 0.0, 0
+    for model, new in listener.listen(seconds + WAIT_SECONDS):
+        hop = float(model.parameters["cc_hSizeSec"])
+        parts.append(levels_of(model, new))
+        frames += len(new.middles)
+        if frames * hop >= seconds:
+            break
+    levels = np.concatenate(parts)
+    level = measured_level(levels)
+    calibration = NoiseCalibration(model.sample_rate, model.parameters, level)
+    calibration.save(path)
+    total = 10 * np.log10(np.sum(10 ** (levels / 10), axis=1)) + model.level_gain_db
+    mean = 10 * np.log10(np.mean(10 ** (total / 10)))
+    say(f"noise level {mean:.1f} dB full scale, from {frames * hop:.1f} s of sound; written to {printable(path)}")
+    if np.quantile(total, 0.98) > np.median(total) + UNSTEADY_DB:
+        say("the level was not steady: if there were other sounds than the noise, repeat the calibration")
+    return calibration

@@ -6,9 +6,10 @@ import os
 from pathlib import Path
 
 from rosafe.localization import model_cache
+from rosafe.localization.live import OK, WARN
 from rosafe.localization.localizer import Localizer
 from rosafe.localization.noise import NoiseCalibration
-from rosafe.ros1.localizer.status import OK, WARN, NodeStatus
+from rosafe.ros1.localizer.status import NodeStatus
 from rosafe.system.trust import foreign
 
 NO_FILE = "none"  # the value of ~noise without a file
