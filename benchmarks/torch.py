@@ -41,7 +41,7 @@ def asteroid(taps: int) -> Callable[[Any], Any]:
     """Return the filterbank of asteroid at the rate of the sound, by convolution with `taps` samples."""
     import numpy as np
 
-    np.complex = complex  # type: ignore[attr-defined]  # asteroid-filterbanks 0.4.0 needs a name that NumPy has removed
+    np.complex, np.float = complex, float  # names that NumPy has removed, and asteroid-filterbanks 0.4.0 needs
     from asteroid_filterbanks import Encoder
     from asteroid_filterbanks.multiphase_gammatone_fb import MultiphaseGammatoneFB
 
