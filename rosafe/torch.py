@@ -52,7 +52,7 @@ class _Layer(torch.nn.Module):
     parameters : mapping, optional
         Names and values as in `rosafe.process`; those of stages above have an effect as far as this stage depends on
         them.
-    learn : sequence of str
+    learn : sequence of str, or str
         Parameters that become `torch.nn.Parameter` of the same name and unit, in float64.
 
     Raises
@@ -64,11 +64,11 @@ class _Layer(torch.nn.Module):
     KIND = ""
 
     def __init__(
-        self, sample_rate: float, parameters: Mapping[str, Any] | None = None, learn: Sequence[str] = ()
+        self, sample_rate: float, parameters: Mapping[str, Any] | None = None, learn: Sequence[str] | str = ()
     ) -> None:
         super().__init__()
         front = _stages(sample_rate, parameters, [self.KIND])
-        self._begin(front[self.KIND], learn)
+        self._begin(front[self.KIND], _names(learn))
 
     @classmethod
     def _of(cls, stage: Stage, learn: Sequence[str]) -> Any:
@@ -146,13 +146,16 @@ class PreProcessing(_Layer):
                 self._steps.append((step.decay_factor, step.start_samples))
             else:
                 taps = step.taps if isinstance(step, Fir) else np.array([1.0, -step.coefficient])
-                self._steps.append(torch.from_numpy(taps[::-1].copy()))
+                length = max(CHUNK, len(taps))
+                padding = np.zeros(length - 1)
+                table = scipy.linalg.toeplitz(np.r_[taps[::-1], padding], np.r_[taps[-1], padding])
+                self._steps.append(torch.from_numpy(table))
         self._gain = stage._gain
 
     def forward(self, sound: Tensor) -> Tensor:
         """Condition sound."""
         samples = _ears(sound)
-        if not self._steps:
+        if not self._steps or not samples.shape[-1]:
             return samples * self._gain
         done = samples.double()
         with torch.autocast(done.device.type, enabled=False):
@@ -271,7 +274,7 @@ class _Framed(_Layer):
         table = torch.nn.functional.pad(weights / size, (0, parts * hop - size)).reshape(parts, hop).to(samples)
         length = (frames + parts - 1) * hop if frames else 0
         padded = torch.nn.functional.pad(samples[..., :length], (0, max(0, length - samples.shape[-1])))
-        sums = padded.reshape(*samples.shape[:-1], -1, hop) @ table.T  # each part of a hop, by each part of the window
+        sums = padded.unflatten(-1, (length // hop, hop)) @ table.T  # each part of a hop, by each part of the window
         return sum(sums[..., part : part + frames, part] for part in range(parts))
 
 
@@ -289,7 +292,9 @@ class Ratemap(_Framed):
         """Return the ratemap."""
         samples = _floats(samples)
         with torch.autocast(samples.device.type, enabled=False):
-            smooth = _leaky_integrator(-1 / (self.sample_rate * self.value("rm_decaySec"))).filter(samples)
+            decay = torch.exp(-1 / (self.sample_rate * self.value("rm_decaySec")))
+            # the logarithm of the rounded factor: for long decays, 1 - r is that of `rosafe.process`
+            smooth = _leaky_integrator(decay.clamp(min=TINY).log()).filter(samples)
             return self._means(smooth.square() if self._power else smooth, self._weights)
 
 
@@ -322,8 +327,9 @@ class CrossCorrelation(_Framed):
         """Return the normalised correlations at lags from -M to M samples."""
         samples = _two_ears(samples)
         size = len(self.window)
-        if samples.shape[-1] < size:
-            return samples.new_zeros((*samples[:, 0].shape[:-1], 2 * self._max_lag + 1, 0))
+        count = max(0, (samples.shape[-1] - size) // self.hop + 1)
+        if not count or not len(samples):  # MKL transforms no empty batch
+            return samples.new_zeros((*samples[:, 0].shape[:-1], 2 * self._max_lag + 1, count))
         reach, transform = self._reach, self._transform
         with torch.autocast(samples.device.type, enabled=False):
             frames = samples.unfold(-1, size, self.hop) * self.window.to(samples)
@@ -353,7 +359,7 @@ class FrontEnd(torch.nn.Module):
         Names and values as in `rosafe.process`, such as ``{"fb_nChannels": 32}``.
     outputs : sequence of str, or str
         Some of `input`, `preProc`, `gammatone`, `ihc`, `ratemap`, `ild` and `crossCorrelation`.
-    learn : sequence of str
+    learn : sequence of str, or str
         Some of `fb_cfHz` (Hz), `fb_bwERBs` (ERBs) and `rm_decaySec` (s). They become `torch.nn.Parameter` in these
         units, of the layers `gammatone` and `ratemap`: give each a learning rate of its own. Values outside of the
         range of a parameter count as its end.
@@ -376,7 +382,7 @@ class FrontEnd(torch.nn.Module):
         sample_rate: float,
         parameters: Mapping[str, Any] | None = None,
         outputs: Sequence[str] | str = ("ratemap",),
-        learn: Sequence[str] = (),
+        learn: Sequence[str] | str = (),
     ) -> None:
         super().__init__()
         self.outputs = tuple(check_outputs(outputs))
@@ -384,7 +390,7 @@ class FrontEnd(torch.nn.Module):
         if unknown:
             raise ValueError(f"outputs: expected some of input, {', '.join(_LAYERS)}, got {unknown[-1]}")
         stages = _stages(sample_rate, parameters, self.outputs)
-        learn = [learn] if isinstance(learn, str) else list(learn)
+        learn = _names(learn)
         possible = [name for kind in stages for name in LEARNABLE.get(kind, ())]
         for name in learn:
             if name not in possible:
@@ -478,15 +484,14 @@ class _Recursion:
 
     def filter(self, samples: Tensor) -> Tensor:
         """Filter (..., N) along its last axis; with channels, (..., 1, N) to (..., C, N)."""
-        direct, to_state, step, from_state = (
-            table.to(samples) for table in (self._direct, self._to_state, self._step, self._from_state)
-        )
+        direct, to_state, from_state = (table.to(samples) for table in (self._direct, self._to_state, self._from_state))
+        step = self._step  # in float64, as errors of its powers grow with the length of the sound
         count = samples.shape[-1]
         chunks = torch.nn.functional.pad(samples, (0, -count % CHUNK)).unflatten(-1, (-(-count // CHUNK), CHUNK))
         states = (chunks @ to_state)[..., :-1, :]  # after each chunk but the last: (..., K - 1, D)
         reach = 1
         while reach < states.shape[-2]:
-            states = states + torch.nn.functional.pad(states[..., :-reach, :] @ step, (0, 0, reach, 0))
+            states = states + torch.nn.functional.pad(states[..., :-reach, :] @ step.to(samples), (0, 0, reach, 0))
             step, reach = step @ step, 2 * reach
         before = torch.nn.functional.pad(states, (0, 0, 1, 0))[..., : chunks.shape[-2], :]
         return (chunks @ direct + before @ from_state).flatten(-2)[..., :count]
@@ -499,10 +504,18 @@ def _leaky_integrator(log_decay: Tensor) -> _Recursion:
     return _Recursion(response, response.flip(0)[:, None], powers[-1:, None], powers[None, 1:])
 
 
+def _names(learn: Any) -> list[str]:
+    """Return `learn` as a list."""
+    try:
+        return [learn] if isinstance(learn, str) else list(learn)
+    except TypeError:
+        raise ValueError(f"learn: expected a sequence of names, got {short_repr(learn)}") from None
+
+
 def _stages(sample_rate: float, parameters: Any, outputs: Sequence[str]) -> dict[str, Any]:
     """Return the stages that `outputs` need, by kind."""
+    sound = SignalFormat.sound(SAMPLE_RATE.check(sample_rate))
     try:
-        sound = SignalFormat.sound(SAMPLE_RATE.check(sample_rate))
         return create_stages(sound, check_parameters(parameters), needed(outputs))
     except ValueError as problem:
         raise rate_advice(problem, sample_rate).with_traceback(None) from None
@@ -516,20 +529,23 @@ def _bounds(name: str, stage: Stage) -> tuple[float, float]:
     return declared.minimum + 1e-6, high * (1 - 1e-6)
 
 
-def _fir(samples: Tensor, reversed_taps: Tensor) -> Tensor:
-    """Return samples (batch, ears, N), filtered by (K,) in reversed order."""
-    taps = reversed_taps.to(samples)
-    padded = torch.nn.functional.pad(samples.flatten(0, 1)[:, None], (len(taps) - 1, 0))
-    return torch.nn.functional.conv1d(padded, taps[None, None]).reshape(samples.shape)
+def _fir(samples: Tensor, table: Tensor) -> Tensor:
+    """Return samples (..., N), filtered by K taps in chunks of T samples: (T + K - 1, T).
+
+    `conv1d` in float64 stores a copy of the samples for each tap.
+    """
+    size, length = table.shape
+    count = samples.shape[-1]
+    padded = torch.nn.functional.pad(samples, (size - length, -count % length))
+    return (padded.unfold(-1, size, length) @ table.to(samples)).flatten(-2)[..., :count]
 
 
 def _gain_controlled(samples: Tensor, decay_factor: float, start_samples: float) -> Tensor:
     """Return samples (batch, ears, N) over the running RMS of the louder ear; see `preproc.GainControl`."""
     count, block = samples.shape[-1], DEFAULT_FRAMES_PER_BLOCK
-    if count == 0:
-        return samples
     squares = samples.square()
-    sounds = torch.nn.functional.pad((samples != 0).int(), (0, -count % block)).unflatten(-1, (-1, block)).amax(-1)
+    padded = torch.nn.functional.pad((samples != 0).int(), (0, -count % block))
+    sounds = padded.unflatten(-1, (-(-count // block), block)).amax(-1)
     first = sounds.argmax(-1, keepdim=True) * block  # sample at which the control starts
     lengths = (count - first).clamp(1, round_half_away(min(block, start_samples)))
     k = torch.arange(count, dtype=samples.dtype, device=samples.device)
