@@ -48,7 +48,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.epilog = (
         "examples:\n"
-        "  scripts/demo                              the built-in scene\n"
+        "  rosafe demo                               the built-in scene; scripts/demo installs what is missing first\n"
         "  scripts/demo speech.wav --seconds 5       a sound file with two channels\n"
         "  scripts/demo plughw:1,0 --out /tmp/me     a microphone pair"
     )

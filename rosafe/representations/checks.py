@@ -30,6 +30,7 @@ REQUESTS = [
     "loadSetup",
     "modifyParameter",
     "removeProcessor",
+    "removeUnused",
     "request",
     "saveSetup",
 ]

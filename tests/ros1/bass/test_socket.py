@@ -64,7 +64,7 @@ class Server:
         self.thread.start()
 
     def clients(self) -> int:
-        return len(self._socket._clients)
+        return sum(thread.name == "socket client" for thread in threading.enumerate())
 
     @contextmanager
     def client(self) -> Iterator[socket.socket]:
