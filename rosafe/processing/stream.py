@@ -313,7 +313,7 @@ def _describe(rate: float, stages: Mapping[str, Stage], outputs: Sequence[str]) 
     described: dict[str, Any] = {}
     for kind, stage in stages.items():
         known = {**stage.parameters, **stage.derived}
-        parameters.update(stage.parameters)
+        parameters.update(stage.request_values(stage.parameters))
         described.update({name: axis_values(known[name]) for name in KINDS[kind].coordinates})
         if stage.output_format.framed and kind in outputs:
             described[f"{kind}_frameRate"] = stage.output_format.rate

@@ -107,6 +107,14 @@ def test_describe() -> None:
     assert described["units"]["ild"] == "dB" and described["ild_frameRate"] == 100.0 and len(described["cc_lags"]) == 37
 
 
+def test_a_stream_with_the_described_parameters_is_equal() -> None:
+    for parameters in ({"fb_cfHz": [200.0, 400.0, 900.0]}, {"fb_nChannels": 3}, {}):
+        first = rosafe.Stream(RATE, parameters, ["ratemap"])
+        second = rosafe.Stream(RATE, first.describe()["parameters"], ["ratemap"])
+        sound = np.random.default_rng(1).standard_normal((2, 1000))
+        assert_same(first.process(sound), second.process(sound))
+
+
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
