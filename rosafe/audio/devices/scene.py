@@ -17,7 +17,6 @@ from rosafe.audio.devices.base import PacedSource, device_error, hwparams_error,
 from rosafe.audio.files.audiofile import to_int32
 from rosafe.localization.filters import HOP, SourceRenderer
 from rosafe.localization.scene import BLOCK, SceneRenderer, Truth
-from rosafe.localization.scene_file import SUFFIXES, SampleRateError, SceneError, read_scene
 from rosafe.localization.sphere import sphere_filters
 from rosafe.system.option_types import number, seconds, whole_number
 
@@ -170,6 +169,9 @@ class SceneFileSource(PacedSource):
     """
 
     def __init__(self, path: str, sample_rate: int, frames_per_chunk: int, stopping: threading.Event) -> None:
+        # here, as it needs PyYAML, which pip does not install
+        from rosafe.localization.scene_file import SUFFIXES, SampleRateError, SceneError, read_scene
+
         super().__init__(f"scene:{path}", stopping)
         if not path.lower().endswith(SUFFIXES):
             raise device_error(f"{self.name}: expected a file that ends in .yaml, or options after a question mark")
