@@ -110,7 +110,7 @@ def main() -> None:
         first = first or forward + backward
         ratio = (forward + backward) / first
         rows.append([name, f"{forward:.3f}", f"{backward:.3f}", f"{ratio:.2f}", f"{memory:.0f}", remark])
-    page.table(["layer", "forward, s", "backward, s", "both, relative", "memory, MB", "what it computes"], rows)
+    page.table(["layer", "forward, s", "backward, s", "both, relative", "memory, MB", "remark"], rows)
     page.write("torch.md")
     return None
 

@@ -551,7 +551,7 @@ def _gain_controlled(samples: Tensor, decay_factor: float, start_samples: float)
     k = torch.arange(count, dtype=samples.dtype, device=samples.device)
     start = (squares * ((k >= first) & (k < first + lengths))).sum(-1, keepdim=True) / lengths
     begun = torch.where(k >= first, decay_factor ** (k - first + 1).clamp(min=0), 0.0)
-    log_decay = torch.tensor(math.log(decay_factor), dtype=samples.dtype, device=samples.device)
+    log_decay = torch.tensor(math.log(max(decay_factor, TINY)), dtype=samples.dtype, device=samples.device)
     power = _leaky_integrator(log_decay).filter(squares) + start * begun
     loud = power > 0
     rms = torch.where(loud, torch.where(loud, power, 1.0).sqrt(), 0.0).amax(1, keepdim=True)

@@ -98,6 +98,14 @@ def test_the_numbers_are_those_of_process(seed: int) -> None:
             assert error <= tolerance * np.abs(expected[kind]).max(initial=0), (kind, dtype, parameters)
 
 
+def test_a_gain_control_of_less_than_a_sample() -> None:
+    values = {"pp_bNormalizeRMS": True, "pp_intTimeSecRMS": 1e-9}
+    sound = np.random.default_rng(1).standard_normal((2, 500))
+    expected = rosafe.process(sound, 16000, parameters=values, outputs="preProc")["preProc"]
+    found = PreProcessing(16000, values)(torch.tensor(sound)[None])[0].numpy()
+    assert np.abs(found - expected).max() <= 1e-10 * np.abs(expected).max()
+
+
 def test_one_ear_and_low_precision() -> None:
     sound = np.random.default_rng(1).standard_normal((3, 4000))
     expected = np.stack([rosafe.process(one, 16000, outputs="ratemap")["ratemap"] for one in sound])

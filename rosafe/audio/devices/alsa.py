@@ -300,7 +300,7 @@ class PcmOpener:
         return DeviceBusyError(why) if text == os.strerror(errno.EBUSY) else device_error(why)
 
     def _differences(self, pcm: Any, info: dict[str, Any], channels: int) -> list[str]:
-        """Return how the open PCM differs from the request, and what it offers instead."""
+        """Return the differences of the open PCM from the request, and its own values."""
         differences = []
         if info["format_name"] != "S32_LE":
             formats = ", ".join(sorted(pcm.getformats())) or info["format_name"]
