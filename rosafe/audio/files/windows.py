@@ -85,9 +85,8 @@ class WindowStream:
     """
 
     def __init__(self, hop: float = 1, width: int = 1, with_first: bool = True) -> None:
-        self.end = (
-            0  # audio frames from the beginning of the sound to the end of the newest message; 0 before the first
-        )
+        # audio frames from the beginning of the sound to the end of the newest message; 0 before the first
+        self.end = 0
         self.frames = 0  # the same in frames of the stream; negative until the first one is complete
         self._hop, self._width, self._with_first = hop, width, with_first
         self._origin = (0, 0)  # `end` and `frames` of the first message

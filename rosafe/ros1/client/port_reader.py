@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rosafe.audio.files.windows import MAX_INDEX, MAX_WINDOW, WindowStream, mismatch, rows_of, window_error
+from rosafe.declarations.text import short_repr
 from rosafe.interface import BASS, KINDS, LAYOUTS
 from rosafe.ros1.client.frame_clock import FrameClock
 from rosafe.ros1.client.tree_snapshot import TreeSnapshot
@@ -313,10 +314,12 @@ class PortReader(PortSubscription):
     Raises
     ------
     ValueError
-        The topic is not that of a port.
+        The topic is not that of a port, or `queue_size` is not a whole number from 1 on.
     """
 
     def __init__(self, topic: str, callback: Callable[[Frames], None] | None = None, queue_size: int = 100) -> None:
+        if not isinstance(queue_size, (int, np.integer)) or queue_size < 1:
+            raise ValueError(f"queue_size: expected a whole number from 1 on, got {short_repr(queue_size)}")
         self._arrived = threading.Condition()
         self._waiting: deque[Frames] = deque()
         self._queue_size = queue_size
@@ -329,11 +332,15 @@ class PortReader(PortSubscription):
         ------
         TimeoutError
             No frames have arrived, or the reader was closed.
+        ValueError
+            `timeout` is not a number.
         rospy.ROSInterruptException
             This node ends.
         """
         import rospy
 
+        if timeout is not None and not (isinstance(timeout, (int, float, np.number)) and timeout == timeout):
+            raise ValueError(f"timeout: expected seconds or None, got {short_repr(timeout)}")
         end = math.inf if timeout is None else time.monotonic() + timeout
         with self._arrived:
             while not self._waiting:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -209,6 +210,20 @@ def test_another_topic_is_rejected(afe: Session) -> None:
         ValueError, match="topic: expected a port such as /rosAFE/ildPort/ild or /bass/Audio, got /rosout"
     ):
         PortReader("/rosout")
+
+
+@pytest.mark.parametrize("size", [0, -1, 1.5, None, "3"])
+def test_a_queue_without_room_is_rejected(size: Any) -> None:
+    with pytest.raises(ValueError, match="queue_size: expected a whole number from 1 on, got "):
+        PortReader(TOPICS["ild"], queue_size=size)
+
+
+def test_a_timeout_is_a_number(ild: PortReader) -> None:
+    for timeout in (float("nan"), "1"):
+        with pytest.raises(ValueError, match="timeout: expected seconds or None, got "):
+            ild.read(timeout)  # type: ignore[arg-type]
+    with pytest.raises(TimeoutError):
+        ild.read(-1.0)
 
 
 def test_a_reader_and_a_subscriber_in_one_process(afe: Session) -> None:
