@@ -24,7 +24,7 @@ from rosafe.dsp.gammatone import GammatoneBank
 from rosafe.dsp.numeric_limits import EPSILON, TINY
 from rosafe.dsp.rounding import round_half_away
 from rosafe.dsp.signal_format import SignalFormat
-from rosafe.dsp.sos_filter import NormalFormFilter, normal_form
+from rosafe.dsp.sos_filter import HighPass
 from rosafe.dsp.stage import SAMPLE_RATE, Stage
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs, check_parameters, needed
@@ -140,8 +140,8 @@ class PreProcessing(_Layer):
     def _design(self, stage: Any) -> None:
         self._steps: list[Any] = []
         for step in stage._steps:
-            if isinstance(step, NormalFormFilter):
-                self._steps.extend(map(_Recursion.of_section, step.sections))
+            if isinstance(step, HighPass):
+                self._steps += [_Recursion.of_pole(*form) for form in step.forms]
             elif isinstance(step, GainControl):
                 self._steps.append((step.decay_factor, step.start_samples))
             else:
@@ -463,8 +463,17 @@ class _Recursion:
 
     @classmethod
     def of_section(cls, section: np.ndarray) -> _Recursion:
-        """Design a second-order section for which `normal_form` exists."""
-        b0, pole, weight = normal_form(section)
+        """Design a section b0, b1, b2, 1, a1, a2 with a pair of complex poles, or with one real pole."""
+        b0, b1, b2, _, a1, a2 = section.astype(np.longdouble)
+        if not a2:
+            return cls.of_pole(float(b0), complex(-a1), complex(b1 - b0 * a1))
+        pole = -a1 / 2 + 1j * np.sqrt(a2 - a1 * a1 / 4)
+        weight = ((b1 - b0 * a1) * pole + b2 - b0 * a2) / (2j * pole.imag)
+        return cls.of_pole(float(b0), complex(pole), complex(weight))
+
+    @classmethod
+    def of_pole(cls, b0: float, pole: complex, weight: complex) -> _Recursion:
+        """Design y[n] = b0 x[n] + 2 Re(w s[n-1]), s[n] = p s[n-1] + x[n]; with a real pole b0 x[n] + w s[n-1]."""
         kept = 2 if pole.imag else 1
         powers = np.cumprod(np.r_[1.0, np.full(CHUNK, pole, np.clongdouble)])
         out = kept * weight * powers[:CHUNK]  # of the state before a sample

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import cmath
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -56,42 +58,52 @@ class SosFilter:
         return result
 
 
-def normal_form(section: NDArray[np.float64]) -> tuple[float, complex, complex]:
-    """Return b0, a pole p and a weight w: y[n] = b0 x[n] + 2 Re(w s[n-1]) with s[n] = p s[n-1] + x[n].
+class HighPass:
+    """A Butterworth high-pass of even order, in normal form: one complex pole for each section.
 
-    The section (b0, b1, b2, 1, a1, a2) has a pair of complex poles, or one real pole: then p and w are real, and y[n]
-    is b0 x[n] + w s[n-1].
-    """
-    b0, b1, b2, _, a1, a2 = section.astype(np.longdouble)
-    if not a2:
-        return float(b0), complex(-a1), complex(b1 - b0 * a1)
-    pole = -a1 / 2 + 1j * np.sqrt(a2 - a1 * a1 / 4)
-    weight = ((b1 - b0 * a1) * pole + b2 - b0 * a2) / (2j * pole.imag)
-    return float(b0), complex(pole), complex(weight)
+    y[n] = g x[n] + 2 Re(w s[n-1]) with s[n] = p s[n-1] + x[n], for each pair of poles p. The state of a pole only turns
+    and shrinks. That of `SosFilter` loses digits for cutoffs far below the sample rate: four at 1 Hz and 48 kHz.
 
+    Parameters
+    ----------
+    order : int
+        Even.
+    cutoff, sample_rate : float
+        In Hz. The bilinear transform is prewarped.
 
-class NormalFormFilter:
-    """A cascade of second-order sections with complex poles, in normal form: one complex pole for each section.
-
-    The state of a pole only turns and shrinks. That of `SosFilter` loses digits if the poles are near 1, as those of a
-    high-pass at a few Hz are: four at 1 Hz and 48 kHz.
+    Attributes
+    ----------
+    forms : list of (float, complex, complex)
+        g, p and w of each section.
     """
 
-    def __init__(self, sections: NDArray[np.float64]) -> None:
-        forms = [normal_form(section) for section in sections]
-        self._steps = [(b0, SosFilter(np.array([[0, weight, 0, 1, -pole, 0]]))) for b0, pole, weight in forms]
-        self.sections = sections
+    def __init__(self, order: int, cutoff: float, sample_rate: float) -> None:
+        self.forms = [_high_pass_form(order, pair, cutoff / sample_rate) for pair in range(order // 2)]
+        self._poles = [SosFilter(np.array([[0, weight, 0, 1, -pole, 0]])) for _, pole, weight in self.forms]
 
     def reset(self) -> None:
         """Reset the state to rest."""
-        for _, pole in self._steps:
+        for pole in self._poles:
             pole.reset()
 
     def process(self, block: NDArray[np.float64]) -> NDArray[np.float64]:
         """Filter (*rows, N) along its last axis."""
-        for b0, pole in self._steps:
-            block = b0 * block + 2 * pole.process(block).real
+        for (gain, *_), pole in zip(self.forms, self._poles, strict=True):
+            block = gain * block + 2 * pole.process(block).real
         return block
+
+
+def _high_pass_form(order: int, pair: int, cutoff: float) -> tuple[float, complex, complex]:
+    """Return g, p and w of a section; `cutoff` is relative to the sample rate.
+
+    With the pole s of the analog filter, p = (1 + s) / (1 - s), and d = 1 - p is known without cancellation. The
+    section is g (1 - 1/z)**2 / ((1 - p/z) (1 - p*/z)), so that w = g j d**2 / (2 Im d).
+    """
+    analog = math.tan(math.pi * cutoff) * cmath.exp(1j * math.pi * (order + 1 + 2 * pair) / (2 * order))
+    distance = -2 * analog / (1 - analog)
+    gain = abs(1 / (1 - analog)) ** 2
+    weight = 0.5j * gain * distance * (distance / distance.imag) if distance.imag else 0j  # 0: it has underflowed
+    return gain, 1 - distance, weight
 
 
 class SosFilterBank(SosFilter):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy
 
 from rosafe.declarations.parameter import Parameter
 from rosafe.declarations.reference import cite
@@ -13,7 +12,7 @@ from rosafe.declarations.representation import Representation
 from rosafe.dsp.middle_ear import MODELS, middle_ear_fir
 from rosafe.dsp.numeric_limits import SQUARE_TINY, FloatArray, clamp
 from rosafe.dsp.rounding import round_half_away
-from rosafe.dsp.sos_filter import NormalFormFilter, SosFilter, leaky_integrator
+from rosafe.dsp.sos_filter import HighPass, SosFilter, leaky_integrator
 from rosafe.dsp.stage import Stage
 
 DC_ORDER = 4
@@ -23,7 +22,7 @@ LEVEL_OF_RMS_1 = 100.0  # dB SPL
 class PreProc(Stage):
     """Conditioning of the ear signals, (2, N) to (2, N). Any change of a parameter resets all filters.
 
-    DC removal is a Butterworth high-pass of order 4, in second-order sections. Level scaling multiplies by
+    DC removal is a Butterworth high-pass of order 4, in normal form (`HighPass`). Level scaling multiplies by
     10**((100 - pp_refSPLdB) / 20): in the tree, an RMS of 1 corresponds to 100 dB SPL.
     """
 
@@ -143,14 +142,12 @@ class PreProc(Stage):
             step.reset()
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        steps: list[NormalFormFilter | PreEmphasis | GainControl | Fir] = []
+        steps: list[HighPass | PreEmphasis | GainControl | Fir] = []
         if values["pp_bRemoveDC"]:
             cutoff = values["pp_cutoffHzDC"]
             if cutoff >= self.sample_rate / 2:
                 raise ValueError(f"pp_cutoffHzDC: expected less than half the sample rate, got {cutoff:.12g} Hz")
-            steps.append(
-                NormalFormFilter(scipy.signal.butter(DC_ORDER, cutoff, "highpass", fs=self.sample_rate, output="sos"))
-            )
+            steps.append(HighPass(DC_ORDER, cutoff, self.sample_rate))
         if values["pp_bPreEmphasis"]:
             steps.append(PreEmphasis(abs(values["pp_coefPreEmphasis"])))
         if values["pp_bNormalizeRMS"]:

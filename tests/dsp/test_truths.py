@@ -106,6 +106,27 @@ def test_the_order_of_pre_processing() -> None:
     np.testing.assert_allclose(everything.process(x), last, rtol=0, atol=1e-14 * np.abs(last).max())
 
 
+@pytest.mark.parametrize(("rate", "cutoff"), [(48000, 1.0), (16000, 20.0), (16000, 4000.0), (44100, 1e-3)])
+def test_the_high_pass_is_exact(rate: int, cutoff: float) -> None:
+    """Beside the direct form with poles and state in extended precision."""
+    x = noise("preProc", 1500) + 0.5
+    expected = x.astype(np.longdouble)
+    angles = np.pi * np.arange(5, 9, 2, dtype=np.longdouble) / 8
+    analog = np.tan(np.longdouble(np.pi) * np.longdouble(cutoff) / rate) * np.exp(1j * angles)
+    for pole in (1 + analog) / (1 - analog):
+        section = [abs(1 + pole) ** 2 / 4 * part for part in (1, -2, 1)], [1, -2 * pole.real, abs(pole) ** 2]
+        expected = scipy_signal.lfilter(*(np.array(part, np.longdouble) for part in section), expected)
+    got = PreProc(rate, pp_bRemoveDC=True, pp_cutoffHzDC=cutoff).process(x)
+    assert np.abs(got - expected).max() <= 2e-14 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("cutoff", [5e-324, 1e-300, 1e-12, 1e-7, 1e-5])
+def test_the_lowest_cutoffs_change_nothing(cutoff: float) -> None:
+    x = noise("preProc", 1000) + 0.5
+    got = PreProc(16000, pp_bRemoveDC=True, pp_cutoffHzDC=cutoff).process(x)
+    np.testing.assert_allclose(got, x, rtol=0, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("model", "rate", "peak"),
     [
