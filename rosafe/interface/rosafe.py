@@ -219,7 +219,12 @@ def _ros_services(composites: tuple[Service, ...]) -> tuple[Service, ...]:
             "The section sound is for clients, which call bass",
             parameters=(
                 *load.parameters,
-                Parameter("check", "boolean", False, "Flag to change nothing, and to return what would be created"),
+                Parameter(
+                    "check",
+                    "boolean",
+                    False,
+                    "Flag to change nothing, and to return the names of the processors that it would create",
+                ),
             ),
             outputs=load.outputs[:2],
         ),

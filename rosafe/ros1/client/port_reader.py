@@ -46,7 +46,7 @@ class Frames:
     stamp : float or None
         Clock time (ROS time, s) of the middle of the first frame; None if it is not known (yet).
     kind : str
-        The representation, a key of `rosafe.REPRESENTATIONS`; `Audio` for the port of bass.
+        The representation, such as `ild`, as in `rosafe.process`; `Audio` for the port of bass.
     axes : tuple of str
         Of `data`.
     rate : float
