@@ -17,7 +17,7 @@ from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block, Source, new_block
 from rosafe.tree.history import History
 from rosafe.tree.parameter_updates import ParameterUpdates
-from rosafe.tree.states import State, StateMachine
+from rosafe.tree.states import NO_BLOCK, State, StateMachine
 from rosafe.tree.workers import Workers
 
 T = TypeVar("T")
@@ -288,7 +288,7 @@ class Processor(StateMachine):
     def _publish(self, block: Block, begun: float) -> None:
         """Add the last released block to the history and notify the listener."""
         self.unpublished_block = None
-        if not self.has_consumers:
+        if block is NO_BLOCK:  # `has_consumers` may have been set since the release
             return
         self.blocked_since = begun
         with self._publish_lock:

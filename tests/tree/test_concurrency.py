@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from rosafe.interface import ComponentError
+from rosafe.tree.processor import Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from tests.harness import PATIENCE, wait_for
@@ -76,6 +77,23 @@ def test_a_block_without_consumers_is_freed_when_the_children_are_finished(
     np.testing.assert_array_equal(last, [[3.0], [3.0]])
     latest = tree.add("gammatone", "latest", "parent")
     listener.wait_blocks(latest, 1)
+
+
+def test_consumers_that_come_between_release_and_publication_get_the_next_block(
+    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def add_consumers(processor: Processor, seconds: float) -> None:
+        processor.has_consumers = True
+
+    use_plain_stages(monkeypatch)
+    monkeypatch.setattr(listener, "on_executed", add_consumers)  # called between the two
+    tree.add_input("input", feed, 1, 1.0, 1.0)
+    pre = tree.add("preProc", "pre", "input")
+    pre.has_consumers = False
+    feed.put(count=2)
+    listener.wait_blocks(pre, 1)
+    assert [block.number for block in listener.blocks[pre]] == [1]
+    assert pre.error is None
 
 
 def test_removed_processors_are_freed_without_garbage_collection(feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
