@@ -328,7 +328,7 @@ async def _follow(
     launcher: Launcher, sound: DemoSound, ports: Mapping[str, _Port], begin: Mapping[str, tuple[int, int]]
 ) -> None:
     """Wait until all ports have the seconds of the sound, or it has ended; `begin` has starts and index of each."""
-    from rosafe.view import report
+    from rosafe.results.view import report
 
     say(f"recording {len(ports)} ports for {sound.seconds:.1f} s")
     elapsed, shown, moved = 0.0, 0.0, time.monotonic()
@@ -356,8 +356,8 @@ def _show(sound: DemoSound, ports: Mapping[str, _Port], parameters: Any, plot_fi
     import numpy as np
 
     from rosafe.localization import angles
-    from rosafe.view import axes, figure, report  # matplotlib takes a second to import
-    from rosafe.view.representations import Representations
+    from rosafe.results.view import axes, figure, report  # matplotlib takes a second to import
+    from rosafe.results.view.representations import Representations
 
     def row(port: _Port) -> report.PortRow:
         pace = np.inf if len(port.arrivals) < 2 else np.mean(np.diff(port.arrivals))
@@ -409,7 +409,7 @@ def _directions(sound: DemoSound, port: _Port) -> tuple[dict[str, Any] | None, d
     from rosafe.localization import angles
     from rosafe.localization.localize import localize
     from rosafe.localization.localizer import SPHERE
-    from rosafe.view import report
+    from rosafe.results.view import report
 
     scene = getattr(sound.source, "scene", None)
     head = SPHERE if scene is None else scene.head

@@ -248,8 +248,8 @@ def _contents(form: str, result: Mapping[str, Any], title: str) -> bytes:
     if form == ".png":
         from matplotlib.figure import Figure
 
-        from rosafe.view.axes import png
-        from rosafe.view.directions import draw
+        from rosafe.results.view.axes import png
+        from rosafe.results.view.directions import draw
 
         return png(draw(Figure(), result, title))
     write = {".json": results.as_json, ".csv": results.estimates_csv, _TRACKS: results.tracks_csv}[form]

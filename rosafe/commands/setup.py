@@ -19,11 +19,11 @@ from rosafe.commands import CommandError
 from rosafe.commands._component import component, format_error, prepare
 from rosafe.declarations import ros_names
 from rosafe.interface import MAX_SETUP, ROSAFE, ComponentError
-from rosafe.setups import LOCALIZER_FILES, Setup, SetupError, read, write
 from rosafe.system import option_types
 from rosafe.system.input import read_regular
 from rosafe.system.output import write_whole
 from rosafe.system.terminal import printable
+from rosafe.tree.setups import LOCALIZER_FILES, Setup, SetupError, read, write
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -20,9 +20,9 @@ from rosafe.localization.scene_signals import (
     ToneSignal,
     VowelSignal,
 )
-from rosafe.setups.markup import SetupError, YamlNode, parse
 from rosafe.system.input import read_regular
 from rosafe.system.terminal import printable
+from rosafe.tree.setups.markup import SetupError, YamlNode, parse
 
 SUFFIXES = (".yaml", ".yml")
 MAX_BYTES = 1 << 18

@@ -37,7 +37,7 @@ from rosafe.commands.__main__ import main
 from rosafe.dsp.kernels import build
 from rosafe.localization import training
 from rosafe.ros1.afe.saved_tree import TreeStateFile
-from rosafe.setups import Setup
+from rosafe.tree.setups import Setup
 from rosafe.ros1.transport.registration import _user_lock
 
 for extension in (".npz", ".h5", ".mat", ".csv"):

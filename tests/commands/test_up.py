@@ -16,7 +16,7 @@ import yaml
 
 from rosafe.commands import up
 from rosafe.ros1.transport.master import MasterError, check_master
-from rosafe.setups import Setup
+from rosafe.tree.setups import Setup
 from tests import models
 from tests.harness import ROOT, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
 from tests.terminal import Terminal

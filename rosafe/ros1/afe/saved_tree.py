@@ -16,10 +16,10 @@ from rosafe.declarations import ros_names
 from rosafe.interface import MAX_SETUP, RESTORED_PARAM, ROSAFE, ComponentError
 from rosafe.ros1.afe.audio_input import AudioInput
 from rosafe.ros1.transport import master, registration
-from rosafe.setups import Setup, SetupError, dry_run, plan, read, write
 from rosafe.system.input import read_regular
 from rosafe.system.output import OutputError, write_whole
 from rosafe.system.terminal import printable
+from rosafe.tree.setups import Setup, SetupError, dry_run, plan, read, write
 from rosafe.tree.tree_builder import Planner
 from rosafe.tree.tree_planner import ExistingProcessor, TreePlan, searched
 

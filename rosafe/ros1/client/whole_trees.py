@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from rosafe.declarations import ros_names
 from rosafe.interface import BASS, FIND, LOAD_SETUP, MAX_SEQUENCE, REQUEST, ROSAFE, SAVE_SETUP, ComponentError
 from rosafe.ros1.client.errors import middleware_error
-from rosafe.setups import AcquireSettings, Setup, read, write
+from rosafe.tree.setups import AcquireSettings, Setup, read, write
 from rosafe.tree.tree_planner import ancestor_kinds, kind_of
 
 AUDIO = "Audio"

@@ -14,7 +14,7 @@ import genomix
 import pytest
 import soundfile
 
-from rosafe import setups
+from rosafe.tree import setups
 from tests.harness import Graph, free_port, wait_for
 from tests.matlab import octave
 from tests.web.genomix import world as worlds

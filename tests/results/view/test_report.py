@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rosafe.view import report
+from rosafe.results.view import report
 
 
 def test_the_table_of_ports() -> None:

@@ -14,7 +14,7 @@ import pytest
 from rosafe.interface import BASS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
 from rosafe.ros1.client import whole_trees
-from rosafe.setups import Setup, dry_run, plan, read, setup_processor, write
+from rosafe.tree.setups import Setup, dry_run, plan, read, setup_processor, write
 from rosafe.tree.tree import Tree
 from tests.tree.support import Recorder, end
 from tests.tree.test_tree_builder import Client

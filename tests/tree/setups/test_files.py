@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from rosafe.interface import KINDS, MAX_SETUP, Parameter
 from rosafe.interface.remarks import PRESETS
 from rosafe.representations import STAGES
-from rosafe.setups import AcquireSettings, Setup, SetupError, SetupProcessor, read, setup_processor, write
-from rosafe.setups.setup import parameters_of
+from rosafe.tree.setups import AcquireSettings, Setup, SetupError, SetupProcessor, read, setup_processor, write
+from rosafe.tree.setups.setup import parameters_of
 from rosafe.tree.tree_planner import ExistingProcessor
 
 TREE = """\

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from tkinter import TclError
 
-from rosafe.eltclsh.interpreter import Interpreter
+from rosafe.commands.eltclsh.interpreter import Interpreter
 from rosafe.system.input import read_regular
 from rosafe.system.output import OutputError, write_whole
 

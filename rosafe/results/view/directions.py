@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rosafe.view.axes import image, style
+from rosafe.results.view.axes import image, style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

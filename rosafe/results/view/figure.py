@@ -11,9 +11,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from rosafe.view.axes import frequency_axis, image, style
-from rosafe.view.directions import draw_posterior
-from rosafe.view.representations import Representations
+from rosafe.results.view.axes import frequency_axis, image, style
+from rosafe.results.view.directions import draw_posterior
+from rosafe.results.view.representations import Representations
 
 RATEMAP_DB = 60.0  # dynamic range of the ratemaps
 FLOOR = 1e-14  # power; lower ones are not shown

@@ -11,7 +11,7 @@ from .setup import Setup, SetupProcessor
 _HEAD = "# A setup of rosAFE; load it with `rosafe setup load FILE`."
 
 
-class _Dumper(yaml.SafeDumper):
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
     """Writes one line for each item of a map, and lists in brackets."""
 
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:

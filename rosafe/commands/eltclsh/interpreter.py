@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 LIBRARY = Path(__file__).resolve().parent
-_CODE = LIBRARY.parents[1]
+_CODE = LIBRARY.parents[2]
 # The folder of the Tcl package genomix, in a checkout or relative to lib/python3/dist-packages of an installation.
 PACKAGES = [str(path) for path in (_CODE / "tcl", _CODE.parents[1] / "tcltk") if (path / "genomix").is_dir()]
 

@@ -10,7 +10,7 @@ import pytest
 
 from rosafe import __version__
 from tests import harness
-from tests.eltclsh.conftest import Run, environment
+from tests.commands.eltclsh.conftest import Run, environment
 from tests.harness import PATIENCE
 
 # Both shells run each of these; output, errors and exit code must be equal.

@@ -8,12 +8,12 @@ from pathlib import Path
 from tkinter import TclError
 from typing import TYPE_CHECKING
 
-from rosafe.eltclsh.interpreter import Interpreter
-from rosafe.eltclsh.signals import Signals
+from rosafe.commands.eltclsh.interpreter import Interpreter
+from rosafe.commands.eltclsh.signals import Signals
 from rosafe.system.version import VERSION
 
 if TYPE_CHECKING:  # scripts do not need readline
-    from rosafe.eltclsh.line import LineHistory, LineReader
+    from rosafe.commands.eltclsh.line import LineHistory, LineReader
 
 
 class Prompt:
@@ -63,7 +63,7 @@ class Prompt:
         return ""
 
     def _next_line(self) -> str | None:
-        from rosafe.eltclsh.line import LineCancelled
+        from rosafe.commands.eltclsh.line import LineCancelled
 
         reader, _ = self._editing()
         while True:
@@ -133,7 +133,7 @@ class Prompt:
             if self._tcl.tk.eval("chan flush stdout; chan gets stdin ::el::input") == "-1":
                 raise TclError("no input")
             return str(self._tcl.tk.eval("set ::el::input"))
-        from rosafe.eltclsh.line import LineCancelled
+        from rosafe.commands.eltclsh.line import LineCancelled
 
         reader, history = self._editing()
         entries = history.entries
@@ -171,8 +171,8 @@ class Prompt:
     def _editing(self) -> tuple[LineReader, LineHistory]:
         """Return reader and history; readline is loaded by the first call."""
         if self._reader is None or self._history is None:
-            from rosafe.eltclsh.complete import Completer
-            from rosafe.eltclsh.line import LineHistory, LineReader
+            from rosafe.commands.eltclsh.complete import Completer
+            from rosafe.commands.eltclsh.line import LineHistory, LineReader
 
             completer = Completer(self._tcl)
             self._reader = LineReader(self._tcl, lambda before, word: completer.complete(self._pending + before, word))

@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from tkinter import TclError
 
-from rosafe.eltclsh.interpreter import CANCEL_UNWIND, EVAL_GLOBAL, OK, AsyncProc, Interpreter, library
+from rosafe.commands.eltclsh.interpreter import CANCEL_UNWIND, EVAL_GLOBAL, OK, AsyncProc, Interpreter, library
 
 _NAMES = {number.name.removeprefix("SIG"): number for number in signal.Signals}
 

@@ -11,7 +11,7 @@ import pytest
 
 import rosafe
 from rosafe.audio.devices.scene import Scene
-from rosafe.view.representations import Representations
+from rosafe.results.view.representations import Representations
 
 OUTPUTS = ("gammatone", "ild", "ratemap", "crossCorrelation")
 WALK = 3.0  # s

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import rosafe
-from rosafe.view.representations import Representations
-from tests.view.conftest import aligned
+from rosafe.results.view.representations import Representations
+from tests.results.view.conftest import aligned
 
 
 def test_series_with_different_hops_are_aligned() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from rosafe import __version__
-from rosafe.eltclsh.line import decode, encode
+from rosafe.commands.eltclsh.line import decode, encode
 from tests import harness
-from tests.eltclsh.conftest import environment
+from tests.commands.eltclsh.conftest import environment
 from tests.terminal import Terminal
 
 ELTCLSH = str(harness.SCRIPTS / "eltclsh")

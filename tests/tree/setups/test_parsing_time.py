@@ -10,7 +10,7 @@ import pytest
 
 from rosafe.interface import KINDS, MAX_ACTIVITIES, MAX_SETUP
 from rosafe.interface.rosafe import MAX_PARAMETERS
-from rosafe.setups import SetupError, markup, read, read_parameters
+from rosafe.tree.setups import SetupError, markup, read, read_parameters
 
 SECONDS = 4.0  # of processor time for a text of maximum length; an idle machine needs less than 1 s
 ATTEMPTS = 5

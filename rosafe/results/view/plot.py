@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rosafe.interface import KINDS
+from rosafe.results.view.axes import frequency_axis, image, style
+from rosafe.results.view.coordinates import EARS, axis_coordinates, check_result, frame_times
 from rosafe.system.missing import require
-from rosafe.view.axes import frequency_axis, image, style
-from rosafe.view.coordinates import EARS, axis_coordinates, check_result, frame_times
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

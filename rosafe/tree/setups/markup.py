@@ -42,7 +42,7 @@ class YamlNode(NamedTuple):
     @property
     def empty(self) -> bool:
         """Whether the value is empty."""
-        return self.text is self.items is self.pairs is None
+        return self.text is None and self.items is None and self.pairs is None
 
     def scalar(self, what: str) -> str:
         """Return the text. Raises SetupError, which names `what`, if the node is not a scalar."""

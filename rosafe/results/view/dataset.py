@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rosafe.interface import KINDS, Representation
+from rosafe.results.view.coordinates import EARS, axis_coordinates, check_result, frame_times
 from rosafe.system.missing import require
-from rosafe.view.coordinates import EARS, axis_coordinates, check_result, frame_times
 
 if TYPE_CHECKING:
     from xarray import Dataset

@@ -12,10 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import rosafe
-from rosafe.view import figure
-from rosafe.view.axes import save
-from rosafe.view.representations import Representations
-from tests.view.conftest import OUTPUTS, aligned, tail
+from rosafe.results.view import figure
+from rosafe.results.view.axes import save
+from rosafe.results.view.representations import Representations
+from tests.results.view.conftest import OUTPUTS, aligned, tail
 
 
 def pixels(path: Path) -> np.ndarray:

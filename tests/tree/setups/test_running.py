@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 import yaml
 
-from rosafe.setups import SetupError, read
+from rosafe.tree.setups import SetupError, read
 from tests.harness import ROOT, SCRIPTS, Graph, free_port, wait_for
-from tests.setups.test_files import TREE
+from tests.tree.setups.test_files import TREE
 
 
 @pytest.fixture

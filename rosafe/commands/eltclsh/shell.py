@@ -9,10 +9,10 @@ import sys
 from tkinter import TclError
 from typing import NoReturn
 
-from rosafe.eltclsh.complete import parse
-from rosafe.eltclsh.interpreter import LIBRARY, PACKAGES, Interpreter, library
-from rosafe.eltclsh.prompt import Prompt
-from rosafe.eltclsh.signals import Signals
+from rosafe.commands.eltclsh.complete import parse
+from rosafe.commands.eltclsh.interpreter import LIBRARY, PACKAGES, Interpreter, library
+from rosafe.commands.eltclsh.prompt import Prompt
+from rosafe.commands.eltclsh.signals import Signals
 from rosafe.system.version import VERSION
 
 COMPATIBLE_VERSION = "1.20"  # of the original, for `package require eltclsh`

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests import harness
-from tests.eltclsh.conftest import Run, environment
+from tests.commands.eltclsh.conftest import Run, environment
 from tests.terminal import Terminal
 
 

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 import rosafe
 from rosafe.audio.devices.scene import Scene
 from rosafe.interface import KINDS, Representation
-from rosafe.view import plot as module
-from rosafe.view.plot import draw, plot
+from rosafe.results.view import plot as module
+from rosafe.results.view.plot import draw, plot
 
 RATE = 16000
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rosafe.eltclsh.interpreter import Interpreter
+from rosafe.commands.eltclsh.interpreter import Interpreter
 
 _SPACE = " "  # after a complete word
 
