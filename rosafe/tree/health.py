@@ -161,9 +161,7 @@ class ProcessorHealth:
     ) -> None:
         self._tree, self._error, self._unknown_words = tree, error, unknown_words
         self._slow = SlowCalls(tree, warn)
-        self._meters: dict[
-            Processor, tuple[TaskStatistics, TaskStatistics | None]
-        ] = {}
+        self._meters: dict[Processor, tuple[TaskStatistics, TaskStatistics | None]] = {}
 
     def added(self, processor: Processor, task: TaskStatistics | None = None) -> None:
         """Register a processor that is about to start; its computing time is added to that of `task`."""
