@@ -196,7 +196,7 @@ class Outputs:
 
 def topics_of(processor: Processor) -> list[str]:
     """Return the topics of a processor, relative to the node."""
-    first, *others = processor.representation.parts
+    _, *others = processor.representation.parts
     return [f"~/{processor.name}", *(f"~/{processor.name}/{part.name}" for part in others)]
 
 

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe.audio.devices import Chunk
+from rosafe.audio.stream import capture as capture_module
 from rosafe.audio.stream.capture import MAX_WINDOW, AudioWindow, Capture, Snapshot, check_window
 from rosafe.interface import ComponentError
-from rosafe.audio.stream import capture as capture_module
 
 
 @settings(max_examples=40)
