@@ -1,4 +1,4 @@
-"""A network and a shared memory of their own for ROS 2 programs: nothing leaves the machine, tests do not meet each other."""
+"""A network and a shared memory of their own for the ROS 2 programs of a test: nothing leaves the machine."""
 
 from __future__ import annotations
 
@@ -28,7 +28,15 @@ def variables() -> dict[str, str] | str:
     )
     if check.returncode != 0:
         return f"ROS 2 is not installed in {INSTALLED}, or is outdated; run scripts/install --tests"
-    shell = ["env", "-i", f"HOME={INSTALLED}", "PATH=/usr/sbin:/usr/bin:/sbin:/bin", "bash", "-c", f"{check.stdout}\nenv -0"]
+    shell = [
+        "env",
+        "-i",
+        f"HOME={INSTALLED}",
+        "PATH=/usr/sbin:/usr/bin:/sbin:/bin",
+        "bash",
+        "-c",
+        f"{check.stdout}\nenv -0",
+    ]
     found = subprocess.run(shell, capture_output=True, text=True, check=True).stdout
     return dict(entry.split("=", 1) for entry in found.strip("\0").split("\0"))
 
@@ -38,7 +46,14 @@ class Network:
 
     def __init__(self, env: dict[str, str], home: Path, pid: int) -> None:
         self.env = env | {"HOME": str(home), "ROS_LOG_DIR": str(home / "log")}
-        self._enter = ["nsenter", *(_OTHER_USER and ("--user", "--preserve-credentials")), "--net", "--mount", "-t", str(pid)]
+        self._enter = [
+            "nsenter",
+            *(_OTHER_USER and ("--user", "--preserve-credentials")),
+            "--net",
+            "--mount",
+            "-t",
+            str(pid),
+        ]
         self._processes: list[Process] = []
 
     def start(self, *command: str | Path, cwd: Path | None = None, **env: str) -> Process:
@@ -75,5 +90,3 @@ def network(env: dict[str, str], home: Path) -> Iterator[Network]:
         finally:
             created.close()
             holder.stdin.close()
-
-
