@@ -19,7 +19,7 @@ from tests.audio.pulseaudio import PulseServer
 from tests.dsp.implementations import NUMPY, Choice, levels
 
 # Folders whose tests start commands, browsers, compilers
-STARTING = ("commands", "demo", "web/live", "packaging", "setups")
+STARTING = ("commands", "demo", "web/live", "packaging", "ros2", "setups")
 # Folders whose tests start programs as users do, not as forks
 OF_THE_START = ("demo", "packaging", "soak", "ros1/startup")
 STARTING_FILES = (  # the same for single files

@@ -37,7 +37,8 @@ def main(argv: list[str] | None = None) -> int:
     """Run `rosafe` and return its exit code. SystemExit: 2 for a wrong command line, 0 after -h and --version."""
     name = "rosafe"
     try:
-        words = without_names(sys.argv[1:] if argv is None else argv)
+        words = sys.argv[1:] if argv is None else argv
+        words = words if words[:1] == ["ros2"] else without_names(words)
         words = without_remappings(words) if words[:1] and words[0] in _LAUNCHED else words
         options, rest = _parser(words).parse_known_args(words)
         name = f"rosafe {options.command}"

@@ -14,7 +14,7 @@ from rosafe.ros1.transport import paths
 from tests.commands.command import environment, rosafe, rosafe_alone
 from tests.harness import ROOT, Graph, free_port
 
-EVERYTHING = ["python", "numbers", "kernels", "plugins", "sound files", "ROS", "messages", "master", "address"]
+EVERYTHING = ["python", "numbers", "kernels", "plugins", "sound files", "ROS", "messages", "ROS 2", "master", "address"]
 EVERYTHING += ["alsaaudio", "sound devices", "HTTP server", "Tcl", "plots", "extras"]
 
 
