@@ -1,4 +1,4 @@
-"""Statistical reverberation: reverberation time, direct-to-reverberant ratio, coherence of the ears, and determinism."""
+"""Statistical reverberation: reverberation time, direct-to-reverberant ratio, coherence of the ears, determinism."""
 
 import numpy as np
 import pytest
