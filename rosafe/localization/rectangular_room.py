@@ -7,6 +7,7 @@ Am. 65, 943-950. The walls reflect equally at all frequencies and angles; source
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.fft
@@ -130,6 +131,7 @@ class RoomReflections:
 
     def __init__(self, room: RectangularRoom, filters: HeadFilters, sample_rate: float, seed: int = 0) -> None:
         self._room = room
+        self._filters = filters
         self._rate = sample_rate
         self._seed = seed
         dense = float(np.cbrt(0.75 * IMAGES * room.volume / np.pi))  # m
@@ -137,10 +139,10 @@ class RoomReflections:
         self._lattice = _Lattice(room, self._reach + max(room.size))
         self.reflection = self._solve()
         self._jitter = JITTER * uniform(np.random.PCG64([seed, 1 << 20]), len(self._lattice.orders))
-        self._ring = np.stack([filters.response(float(azimuth)) for azimuth in angles.grid()])
+        ring = np.stack([filters.response(float(azimuth)) for azimuth in angles.grid()])
         self._early = int((self._reach + JITTER) / SPEED_OF_SOUND * sample_rate) + TAPS  # frames, before the head
         self._size = scipy.fft.next_fast_len(self._early + filters.length, real=True)
-        self._spectra = scipy.fft.rfft(self._ring, self._size)
+        self._spectra = scipy.fft.rfft(ring, self._size)
 
     def _solve(self) -> float:
         """Return the ratio of the pressures at a wall, by bisection, for sources that are spread in the room."""
@@ -173,45 +175,47 @@ class RoomReflections:
         chosen = (ways < distance + self._reach) & (self._lattice.orders > 0)
         offsets, ways, orders = offsets[chosen], ways[chosen], self._lattice.orders[chosen]
         delays = np.maximum(ways - distance + self._jitter[chosen], 0.0) * (self._rate / SPEED_OF_SOUND)
-        impulses = np.zeros((len(self._ring), self._early))
-        rows = self._rows(_horizontal(offsets, ways, yaw))
-        _add_impulses(impulses, rows, delays, distance / ways * self.reflection**orders)
+        impulses = np.zeros((len(self._spectra), self._early))
+        rows = np.round(_horizontal(offsets, ways, yaw) / angles.SPACING).astype(int) + len(impulses) // 2 - 1
+        _add_impulses(impulses, rows % len(impulses), delays, distance / ways * self.reflection**orders)
         spectra = np.einsum("df,def->ef", scipy.fft.rfft(impulses, self._size), self._spectra)
         band = scipy.signal.butter(2, HIGH_PASS, "highpass", fs=self._rate, output="sos")
         return np.asarray(scipy.signal.sosfilt(band, scipy.fft.irfft(spectra, self._size)))
 
-    def _rows(self, azimuths: FloatArray) -> np.ndarray:
-        """Return the rows of the responses that are nearest to `azimuths` (degrees)."""
-        return (np.round(azimuths / angles.SPACING).astype(int) + len(self._ring) // 2 - 1) % len(self._ring)
-
+    @cached_property
     def tail(self) -> FloatArray:
-        """Return the diffuse tail (2, N), which depends neither on the source nor on the direction of the head.
+        """The diffuse tail (2, N), which depends neither on the source nor on the direction of the head.
 
-        It begins with the direct sound, as zeros. `tail_gain` is its gain for a source.
+        It begins with the direct sound, as zeros.
         """
         begin = int(self._reach / SPEED_OF_SOUND * self._rate)
         times = np.arange(begin, max(begin + 1, int(self._room.rt60 * self._rate))) / self._rate
         power = 4 * np.pi * SPEED_OF_SOUND / (self._room.volume * self._rate)  # per sample, at first
         envelope = np.sqrt(3.0 * power / TAIL_DIRECTIONS) * 10 ** (-3 * times / self._room.rt60)
-        tail = np.zeros((2, begin + len(times) + self._ring.shape[2] - 1))
+        tail = np.zeros((2, begin + len(times) + self._filters.length - 1))
         lateral = np.degrees(np.arcsin((2 * np.arange(TAIL_DIRECTIONS // 2) + 1) / (TAIL_DIRECTIONS // 2) - 1))
         random = np.random.PCG64([self._seed, (1 << 20) + 1])
         for azimuth in (*lateral, *(180.0 - lateral)):  # of a field that is equal in all directions of space
-            response = self._ring[self._rows(np.array([azimuth]))[0]]
             noise = envelope * uniform(random, len(times))
+            response = self._filters.response(float(angles.wrap(azimuth)))
             tail[:, begin:] += scipy.signal.oaconvolve(noise[np.newaxis], response, axes=-1)
         return tail
 
-    def tail_gain(self, distance: float) -> float:
-        """Return the gain of the tail for a source at a distance (m) whose direct sound has an amplitude of 1."""
-        return distance * 10 ** (-3 * distance / (SPEED_OF_SOUND * self._room.rt60))
+    def of_source(self, azimuth: float, distance: float, yaw: float = 0.0) -> tuple[FloatArray, float]:
+        """Return the image sources (2, N) of a source and the gain of its tail, for a direct sound as in `early`.
 
-    def reverberation(self, early: FloatArray, distance: float, tail: FloatArray) -> FloatArray:
-        """Return image sources and tail (2, N) together for a source at a distance (m)."""
-        whole = np.zeros((2, max(early.shape[1], tail.shape[1])))
-        whole[:, : early.shape[1]] = early
-        whole[:, : tail.shape[1]] += self.tail_gain(distance) * tail
-        return whole
+        They are scaled to `room.drr_db` if it is given.
+        """
+        early = self.early(azimuth, distance, yaw)
+        tail_gain = distance * 10 ** (-3 * distance / (SPEED_OF_SOUND * self._room.rt60))
+        if self._room.drr_db is not None:
+            rest = np.zeros((2, max(early.shape[1], self.tail.shape[1])))
+            rest[:, : early.shape[1]] = early
+            rest[:, : self.tail.shape[1]] += tail_gain * self.tail
+            direct = np.sum(self._filters.response(float(angles.wrap(azimuth - yaw))) ** 2)
+            gain = np.sqrt(direct / np.sum(rest**2)) * 10 ** (-self._room.drr_db / 20)
+            early, tail_gain = early * gain, tail_gain * gain
+        return early, tail_gain
 
 
 class _Lattice:

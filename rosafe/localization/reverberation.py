@@ -9,8 +9,7 @@ import scipy.fft
 
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
-from rosafe.localization.filters import HeadFilters
-from rosafe.localization.rectangular_room import RectangularRoom, RoomReflections
+from rosafe.localization.rectangular_room import RoomReflections
 
 STEP = 3.0  # degrees of source or head until the image sources are computed again
 
@@ -19,39 +18,22 @@ class Reverberation:
     """The reflections of all sources of a scene in a room.
 
     The image sources of each source follow its direction and that of the head: two responses are cross-faded over a
-    block. All sources share the tail. With `room.drr_db`, the reflections of each source are scaled to this ratio.
+    block. All sources share the tail.
 
     Parameters
     ----------
-    room : RectangularRoom
-        The room.
-    filters : HeadFilters
-        Of the head, at the sample rate.
-    sample_rate : float
-        Hz.
-    distances : sequence of float
+    reflections : RoomReflections
+        Of the room at the head.
+    distances : list of float
         Of the sources, m.
     block : int
         Frames of a block.
-    seed : int
-        Of the random numbers.
     """
 
-    def __init__(
-        self,
-        room: RectangularRoom,
-        filters: HeadFilters,
-        sample_rate: float,
-        distances: list[float],
-        block: int,
-        seed: int = 0,
-    ) -> None:
-        self._reflections = RoomReflections(room, filters, sample_rate, seed)
-        self._drr_db = room.drr_db
-        self._filters = filters
+    def __init__(self, reflections: RoomReflections, distances: list[float], block: int) -> None:
+        self._reflections = reflections
         self._distances = distances
-        self._tail = self._reflections.tail()
-        self._late = _Convolver(self._tail, block)
+        self._late = _Convolver(reflections.tail, block)
         self._early: dict[int, tuple[_View, _Convolver]] = {}  # by source
         self._input = np.zeros(block)  # of the tail
 
@@ -88,13 +70,7 @@ class Reverberation:
         return tail
 
     def _view(self, azimuth: float, distance: float, yaw: float) -> tuple[_View, FloatArray]:
-        early = self._reflections.early(azimuth, distance, yaw)
-        tail_gain = self._reflections.tail_gain(distance)
-        if self._drr_db is not None:
-            direct = np.sum(self._filters.response(float(angles.wrap(azimuth - yaw))) ** 2)
-            rest = self._reflections.reverberation(early, distance, self._tail)
-            gain = np.sqrt(direct / np.sum(rest**2)) * 10 ** (-self._drr_db / 20)
-            early, tail_gain = early * gain, tail_gain * gain
+        early, tail_gain = self._reflections.of_source(azimuth, distance, yaw)
         return _View(azimuth, yaw, tail_gain), early
 
 

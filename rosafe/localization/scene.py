@@ -18,7 +18,7 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 from rosafe.localization.filters import HOP, HeadFilters, SourceRenderer
 from rosafe.localization.head import Head
-from rosafe.localization.rectangular_room import RectangularRoom
+from rosafe.localization.rectangular_room import RectangularRoom, RoomReflections
 from rosafe.localization.reverberation import Reverberation
 from rosafe.localization.scene_signals import SourceSignal, uniform
 
@@ -173,7 +173,8 @@ class SceneRenderer(OwnState):
         self._reverberation = None
         if scene.room is not None:
             distances = [DEFAULT_DISTANCE if scene.room.drr_db is not None else s.distance for s in scene.sources]
-            self._reverberation = Reverberation(scene.room, filters, scene.sample_rate, distances, BLOCK, scene.seed)
+            reflections = RoomReflections(scene.room, filters, scene.sample_rate, scene.seed)
+            self._reverberation = Reverberation(reflections, distances, BLOCK)
         self._frame = 0  # the first one of the next block
         self._rest = np.zeros((2, 0))
 

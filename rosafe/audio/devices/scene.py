@@ -16,7 +16,7 @@ from scipy import signal
 from rosafe.audio.devices.base import PacedSource, device_error, hwparams_error, parse_options
 from rosafe.audio.files.audiofile import to_int32
 from rosafe.localization.filters import HOP, SourceRenderer
-from rosafe.localization.rectangular_room import MAX_DRR, MAX_RT60, MIN_DRR, MIN_RT60, RectangularRoom
+from rosafe.localization.rectangular_room import MAX_DRR, MAX_RT60, MIN_DRR, MIN_RT60, RectangularRoom, RoomReflections
 from rosafe.localization.reverberation import Reverberation
 from rosafe.localization.scene import BLOCK, DEFAULT_DISTANCE, SceneRenderer, Truth
 from rosafe.localization.scene_signals import uniform
@@ -70,8 +70,8 @@ class Scene:
         self._renderer = SourceRenderer(filters)
         self._reverberation = None
         if rt60 is not None:
-            room = RectangularRoom.drawn(rt60, drr, seed)
-            self._reverberation = Reverberation(room, filters, sample_rate, [DEFAULT_DISTANCE], BLOCK, seed)
+            reflections = RoomReflections(RectangularRoom.drawn(rt60, drr, seed), filters, sample_rate, seed)
+            self._reverberation = Reverberation(reflections, [DEFAULT_DISTANCE], BLOCK)
         self._frame = 0  # number of the first frame of the next block
         self._block = np.zeros((2, 0), np.int32)
 
