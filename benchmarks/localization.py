@@ -468,8 +468,8 @@ def section_rooms(run: Map) -> str:
     shares = {"estimates": [str(n) for _, n, _ in calibrated], "right": [f"{share:.3f}" for *_, share in calibrated]}
     return (
         "## Rooms: one talker, matched head\n\n"
-        f"Speech in {len(PLACES)} rectangular rooms, from {len(DIRECTIONS[::EVERY])} directions, {ROOM_SECONDS:g} s each, "
-        "estimates from one second. Image sources and a diffuse tail through KEMAR "
+        f"Speech in {len(PLACES)} rectangular rooms, from {len(DIRECTIONS[::EVERY])} directions, {ROOM_SECONDS:g} s "
+        "each, estimates from one second. Image sources and a diffuse tail through KEMAR "
         "(rosafe/localization/rectangular_room.py); training uses none of these rooms and no image sources. The "
         "reflections are scaled to the ratio of direct to reverberant energy. Noise at 60 dB. What these rooms cannot "
         "show: furniture, walls that absorb some frequencies more than others, talkers that radiate to one side, and "
@@ -550,8 +550,8 @@ def section_rooms_heads(run: Map) -> str:
             rows[f"{title}, {ratio:g} dB"] = row
     missing = "" if SURREY.exists() else " The Surrey head is missing here."
     return (
-        "## Rooms: other heads and microphones\n\nSpeech as above, the rooms in turn, one for each direction. Directions "
-        f"are compared by their lateral angle. Pairs: up to 60 degrees from straight ahead.{missing}\n\n"
+        "## Rooms: other heads and microphones\n\nSpeech as above, the rooms in turn, one for each direction. "
+        f"Directions are compared by their lateral angle. Pairs: up to 60 degrees from straight ahead.{missing}\n\n"
         + table("sound, model, ratio", ("within 5 degrees", "RMS in degrees", "trials"), rows)
     )
 
@@ -584,8 +584,8 @@ def section_rooms_two(run: Map) -> str:
         "seconds": [str(len(both)) for both, _ in columns],
     }
     return (
-        "## Rooms: two talkers of equal level, 30 to 90 degrees apart in the front half\n\nMatched head, the rooms above "
-        "in turn, 10 s for each pair of positions. Counted as without a room.\n\n"
+        "## Rooms: two talkers of equal level, 30 to 90 degrees apart in the front half\n\nMatched head, the rooms "
+        "above in turn, 10 s for each pair of positions. Counted as without a room.\n\n"
         + table("direct-to-reverberant ratio (dB)", RATIOS, rows)
     )
 
