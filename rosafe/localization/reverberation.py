@@ -11,7 +11,7 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 from rosafe.localization.rectangular_room import RoomReflections
 
-STEP = 3.0  # degrees of source or head until the image sources are computed again
+STEP = 3.0  # degrees by which source or head move until the image sources are computed again
 
 
 class Reverberation:
@@ -56,7 +56,8 @@ class Reverberation:
             view, early = self._view(azimuths[0], distance, yaws[0])
             convolver = _Convolver(early, len(samples))
         following, response = view, None
-        if view.differs(azimuths[-1], yaws[-1]):
+        rests = azimuths[0] == azimuths[-1] and yaws[0] == yaws[-1]
+        if view.difference(azimuths[-1], yaws[-1]) > (0.0 if rests else STEP):
             following, response = self._view(azimuths[-1], distance, yaws[-1])
         self._early[number] = following, convolver
         fade = np.arange(len(samples)) / len(samples)
@@ -82,9 +83,9 @@ class _View:
     yaw: float
     tail_gain: float
 
-    def differs(self, azimuth: float, yaw: float) -> bool:
-        """Return whether source or head have moved by more than `STEP`."""
-        return max(abs(angles.difference(azimuth, self.azimuth)), abs(angles.difference(yaw, self.yaw))) > STEP
+    def difference(self, azimuth: float, yaw: float) -> float:
+        """Return by how many degrees source or head have moved."""
+        return max(abs(angles.difference(azimuth, self.azimuth)), abs(angles.difference(yaw, self.yaw)))
 
 
 class _Convolver:
