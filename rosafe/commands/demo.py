@@ -49,6 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n"
         "  rosafe demo                               the built-in scene; scripts/demo installs what is missing first\n"
+        "  scripts/demo 'scene:?rt60=0.4'            the same in a room with a reverberation time of 0.4 s\n"
         "  scripts/demo speech.wav --seconds 5       a sound file with two channels\n"
         "  scripts/demo plughw:1,0 --out /tmp/me     a microphone pair"
     )
@@ -181,7 +182,8 @@ def choose(argument: str, seconds: float = math.inf) -> DemoSound:
     title, rate = path.name, source.sample_rate
     if argument.startswith("scene:"):
         frames = getattr(source, "frames", None)
-        title = title.removeprefix("scene:") if hasattr(source, "scene") else "A source moves from left to right"
+        walk = "A source moves from left to right" + " in a room" * ("rt60=" in argument)
+        title = title.removeprefix("scene:") if hasattr(source, "scene") else walk
     sound = DemoSound(device, title, rate, seconds, source)
     if frames is None or frames >= seconds * rate:
         return sound
