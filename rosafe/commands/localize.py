@@ -36,7 +36,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
         "rosafe localize SOUND [--head FILE] [--[no-]mirror] [--seconds S] [--yaw FILE.csv]\n"
-        "                       [-o OUT.csv|.json|.png] [--channels L,R] [--set NAME=VALUE ...] [--force]\n"
+        "                       [-o OUT.csv|.json|.png] [--streams FOLDER] [--channels L,R]\n"
+        "                       [--set NAME=VALUE ...] [--force]\n"
         "       rosafe localize [--head FILE] [--[no-]mirror] [--seconds S] [--world-frame NAME] [--head-frame NAME]\n"
         "                       [--rosafe NAME] [--connect TOPIC] [--set NAME=VALUE ...] [--name NAME] [-b] [--wait]\n"
         "                       [NAME:=VALUE ...]"
@@ -60,6 +61,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "-o", "--to", dest="to", metavar="OUT", action="append", help="OUT.csv, OUT.json or OUT.png; may be repeated"
+    )
+    parser.add_argument(
+        "--streams", metavar="FOLDER", type=Path, help="write the separated sound of each source, source-ID.wav"
     )
     parser.add_argument(
         "--channels", metavar="L,R", type=ear_channels, help="channels (from 1) of the left and the right ear"
@@ -136,9 +140,17 @@ def run(options: argparse.Namespace) -> int:
 def _localize(path: str, options: argparse.Namespace) -> int:
     """Localize the sources in a file."""
     files = _files(options)
+    if options.streams is not None:
+        from rosafe.processing.corpus import make_folder
+
+        try:
+            make_folder(options.streams)
+        except OSError as problem:
+            raise CommandError(f"--streams: cannot create {printable(options.streams)}: {problem.strerror}") from None
+        check_target(options.streams / "streams.csv", options.force)
     from rosafe.audio.files.audiofile import AudioFileError
     from rosafe.localization.localize import localize
-    from rosafe.localization.results import estimates_csv, read_yaw
+    from rosafe.localization.results import estimates_csv, read_yaw, stream_files
     from rosafe.processing.sounds import read_ears
 
     try:
@@ -153,22 +165,28 @@ def _localize(path: str, options: argparse.Namespace) -> int:
                 options.seconds or 0.5,
                 parameters_of(options.settings) or None,
                 head_yaw=yaw,
+                streams=options.streams is not None,
             )
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
     for warning in caught:
         if issubclass(warning.category, UserWarning):
             print(f"rosafe localize: {printable(warning.message)}", file=sys.stderr)
-    if not files:
+    if not files and options.streams is None:
         sys.stdout.write(estimates_csv(result))
     title = printable(Path(path).name)
-    write_files({file: _contents(form, result, title) for file, form in files.items()}, options.force)
+    contents = {file: _contents(form, result, title) for file, form in files.items()}
+    if options.streams is not None:
+        contents |= stream_files(result, options.streams)
+        for file in contents:
+            check_target(file, options.force)
+    write_files(contents, options.force)
     return 0
 
 
 def _run_node(options: argparse.Namespace) -> int:
     """Run the node until it ends."""
-    for name in ("yaw", "to", "channels", "force"):
+    for name in ("yaw", "to", "streams", "channels", "force"):
         if getattr(options, name):
             options.usage_error(f"{'-o' if name == 'to' else '--' + name}: expected a sound file as well, got none")
     from rosafe.ros1.component import startup

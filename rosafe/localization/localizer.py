@@ -131,6 +131,11 @@ class Localizer(OwnState):
         """The sources at the moment, those with a low probability included; `id` is 0 until one was present."""
         return self._tracker.tracks
 
+    @property
+    def updated_at(self) -> float:
+        """The time of the last update of `sources` in s, as `time` of `update`; -inf before the first one."""
+        return self._tracker.time
+
     def process(self, block: Any, head_yaw: Any = 0.0) -> dict[str, Any]:
         """Localize the next block of sound.
 

