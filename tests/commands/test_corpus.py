@@ -321,19 +321,6 @@ def test_killed_and_resumed(tmp_path: Path) -> None:
     assert_results(out, sounds)
 
 
-def test_two_runs_into_one_folder(tmp_path: Path) -> None:
-    """Two runs on different files do not interact. On the same files, one run writes each result."""
-    sounds = corpus(tmp_path / "corpus", 16)
-    arguments = ("process", "corpus", "-o", "out", *OPTIONS, "--resume")
-    with start(*arguments, cwd=tmp_path) as first, start(*arguments, cwd=tmp_path) as second:
-        codes = [first.wait(), second.wait()]
-    for code, run in zip(codes, (first, second), strict=True):
-        assert code == 0 or " is writing it" in run.err or "it was created meanwhile" in run.err, run
-    done = rosafe(*arguments, cwd=tmp_path)
-    assert done.returncode == 0 and not (tmp_path / "out" / "failed.csv").exists(), done
-    assert_results(tmp_path / "out", sounds)
-
-
 def test_interrupted(tmp_path: Path) -> None:
     corpus(tmp_path / "corpus", 60)
     out = tmp_path / "out"

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
-import numpy as np
 import pytest
 
 from rosafe.interface import BASS
@@ -144,83 +140,6 @@ def test_values(world: World) -> None:
         f = rosAFE.getParameters('-a');
         assert({f.wait(60), fieldnames(f.result)}, {'done', {'parameters'}});
         """,
-    )
-
-
-PORTS = {
-    "inputProcPort": "input_0",
-    "preProcPort": "time_0",
-    "gammatonePort": "filterbank_0",
-    "ihcPort": "innerhaircell_0",
-    "ildPort": "ild_0",
-    "ratemapPort": "ratemap_0",
-    "crossCorrelationPort": "crosscorrelation_0",
-}
-
-
-def test_port_data_are_exact(world: World, tmp_path: Path) -> None:
-    """All samples of all ports, as matrices and in cells, are equal to those of the port."""
-    octave.run(
-        world,
-        LOADED
-        + f"""
-        acquire = bass.Acquire('-a', 'scene:', 16000);
-        p = struct('fb_nChannels', 3, 'fb_highFreqHz', 4000, 'nFramesPerBlock', 1600, 'bufferSize_s_port', 0.3);
-        for request = {{'ild', 'ratemap', 'crosscorrelation'}}
-            tree = rosAFE.request(request{{1}}, p);
-            assert(tree.status, 'done')
-        end
-        pause(0.5);
-        bass.Stop();
-        ports = {{{", ".join(f"'{port}', '{element}'" for port, element in PORTS.items())}}};
-        ends = [1 2];
-        before = [];
-        while any(ends ~= ends(1)) || ! isequal(ends, before) % until all processors have finished
-            pause(0.3);
-            before = ends;
-            for k = 1:2:numel(ports)
-                one = rosAFE.(ports{{k}})('-m', ports{{k + 1}});
-                ends((k + 1) / 2) = one.(ports{{k}}).lastFrameIndex;
-            end
-        end
-        for k = 1:2:numel(ports)
-            one = rosAFE.(ports{{k}})('-m', ports{{k + 1}}).(ports{{k}});
-            cells = rosAFE.(ports{{k}})(ports{{k + 1}}).(ports{{k}});
-            out = fopen(['{tmp_path}/' ports{{k}}], 'w');
-            fwrite(out, one.left, 'double');
-            if isfield(one, 'right')
-                fwrite(out, one.right, 'double');
-            end
-            fclose(out);
-            if isfield(cells.left, 'data')
-                assert(cell2mat(cells.left.data)', one.left)
-                assert(cell2mat(cells.right.data)', one.right)
-            elseif isfield(cells.left, 'dataN')
-                [left, right] = adaptTFS(one.framesOnPort, 3, cells.left, ! isempty(one.right), cells.right);
-                assert(left, one.left)
-                assert(isempty(one.right) || isequal(right, one.right))
-            else
-                for lag = 1:one.numberOfLags
-                    for channel = 1:3
-                        assert(cell2mat(cells.left.dataNxN{{lag}}.dataN{{channel}}.data)', one.left(:, channel, lag))
-                    end
-                end
-            end
-        end
-        """,
-    )
-    for port, element in PORTS.items():
-        held = world.http.call(f"rosAFE/{port}/{element}")[port]
-        expected = np.concatenate([_flat(held[ear]) for ear in ("left", "right") if ear in held])
-        assert np.std(expected) > 0
-        np.testing.assert_array_equal(np.fromfile(tmp_path / port), expected, err_msg=port)
-
-
-def _flat(signal: dict[str, Any]) -> np.ndarray:
-    """Return a signal of the JSON answer as a vector, ordered by lag, channel and frame."""
-    (inner,) = signal.values()
-    return (
-        np.concatenate([np.empty(0), *map(_flat, inner)]) if inner and isinstance(inner[0], dict) else np.array(inner)
     )
 
 

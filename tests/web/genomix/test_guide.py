@@ -49,51 +49,6 @@ def test_the_guide_runs_as_a_script(fresh_world: World) -> None:
     assert [p["name"] for p in parameters["input"]] == ["input"]
 
 
-def test_each_command_of_the_guide_has_its_documented_result(fresh_world: World) -> None:
-    commands = guide_commands()
-    script = ["set results {}", "proc note {result} {lappend ::results $result}"]
-    for command in commands[:-2]:
-        # Typed at a prompt: the result of each line, which for a line with & is the request.
-        script.append(f"note [uplevel #0 {{{command}}}]")
-    script.append(
-        """
-        foreach name {modify parameters dependencies signals} request [lrange $results end-3 end] {
-            puts [list $name [$request wait 60000] [catch {$request result} result] $result]
-        }
-        set running [concat [lrange $results 4 6] [lrange $results 9 11]]
-        puts [list activities {*}[lmap request $running {$request status}]]
-        """
-    )
-    for command in commands[-2:]:
-        script.append(f"set last [uplevel #0 {{{command}}}]")
-        script.append("puts [list last [$last wait 60000] [catch {$last result} result] $result]")
-    script.append("puts [list plain [lrange $results 0 3] [lrange $results 7 8]]")
-    lines = run_shell(fresh_world, "eltclsh", "\n".join(script)).stdout.splitlines()
-    assert lines[0] == (
-        "modify error 1 {ex ::rosAFE::e_noSuchParameter what "
-        "{processors of kind input have no 'pp_bRemoveDC'; they have: in_doNormalize, in_normalizeValue}}"
-    )
-    for part in (
-        "pp_refSPLdB 100.0",
-        "pp_middleEarModel jepsen",
-        "fb_nChannels 31",
-        "ihc_method dau",
-        "ild_wname hann ild_wSizeSec 0.02 ild_hSizeSec 0.01",
-        "rm_scaling power rm_decaySec 0.008",
-        "name crosscorrelation cc_wname hann cc_wSizeSec 0.02 cc_hSizeSec 0.01 cc_maxDelaySec 0.0011",
-    ):
-        assert part in lines[1]
-    assert lines[1].startswith("parameters done 0 {parameters {input {0 {name input")
-    assert lines[2] == "dependencies done 0 {dependencies {0 input 1 preProc 2 gammatone 3 ihc 4 ratemap}}"
-    assert lines[3].startswith("signals done 0 {signals {input {0 {sampleRate 44100 ")
-    assert lines[4] == "activities sent sent sent sent sent sent"
-    assert lines[5] == "last done 0 {}"
-    assert lines[6].startswith(
-        "last error 1 {ex ::genom::no_such_outport detail {what {preProcPort has no element 'dummyName'"
-    )
-    assert lines[7] == "plain {1.8 genomix1 rosAFE {}} {{} {}}"
-
-
 PATTERNS = {
     "1: literal handle, plugin path": """
         genomix::connect $address
@@ -216,14 +171,6 @@ PATTERNS = {
         set rate 16000
         set r [bass::Acquire -ack [subst {device scene: sampleRate $rate}]]
         show [expr {[dict get [bass::Audio] Audio sampleRate] == $rate ? "" : "not acknowledged"}]
-    """,
-    "23: functions and ports in the background": """
-        set g [genomix::connect $address]
-        $g load rosAFE
-        set all [list [::rosAFE::getParameters &] [::rosAFE::getDependencies {nameProc ratemap} &] \\
-            [::rosAFE::getSignals {} &] [::rosAFE::removeProcessor {name preProc} &] \\
-            [::rosAFE::preProcPort dummyName &]]
-        show [expr {[lmap r $all {$r wait 60000}] eq {done error done error error} ? "" : [lmap r $all {$r status}]}]
     """,
     "24b: continued lines and comments": """
         set g [genomix::connect $address]

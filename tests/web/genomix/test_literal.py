@@ -100,18 +100,6 @@ def test_the_values_of_get_parameters_create_an_equal_processor(world: World) ->
     assert reported_parameters(world, "gammatone", "second") == {**first, "name": "second"}
 
 
-def test_zeros_of_tcl(world: World) -> None:
-    script = """
-        rosAFE::PreProc {name a pp_coefPreEmphasis 0}
-        set r [rosAFE::PreProc {name b pp_coefPreEmphasis 0} &]
-        while {[catch {rosAFE::getDependencies b}]} {}
-        dict for {- one} [dict get [rosAFE::getParameters] parameters preProc] {
-            show [dict get $one name] [dict get $one pp_coefPreEmphasis]
-        }
-    """
-    assert world.lines(INPUT + script) == ["a|0.0", "b|0.0"]
-
-
 # --- unknown words ----------------------------------------------------------------------------------------------
 
 

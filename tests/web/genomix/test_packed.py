@@ -8,7 +8,6 @@ from __future__ import annotations
 import http.client
 import json
 import math
-import random
 import shutil
 import struct
 import subprocess
@@ -27,7 +26,6 @@ from rosafe.web.genomix import binary_format
 from tests.harness import PATIENCE, ROOT, proc
 from tests.web.genomix.world import World
 
-SIZES = (1, 2, 255, 65_536, 1_000_000, 2**24, 2**30, 2**31 - 1, 2**31, 2**32 - 8, 2**32 - 1)
 SPECTRUM = "::rosAFE::TimeFrequencySignalPortStruct"
 
 
@@ -263,29 +261,6 @@ CRAFTED = [
 GOOD = [signal(("dataN", 31), ("data", 0)), signal(("dataNxN", 1000), ("dataN", 1000), ("data", 0)), *documents()]
 
 
-def mutants(count: int) -> list[bytes]:
-    """Truncated answers, answers with changed bytes and counts, and random bytes."""
-    chance = random.Random(0)
-    made = [document[:at] for document in documents() for at in range(len(document))]
-    made = made[:: 1 + 2 * len(made) // count]
-    while len(made) < count:
-        data = bytearray(chance.choice(documents()))
-        for _ in range(chance.randint(1, 3)):
-            at = chance.randrange(len(data))
-            kind = chance.random()
-            if kind < 0.4:
-                data[at : at + 4] = struct.pack("<I", chance.choice(SIZES))
-            elif kind < 0.7:
-                data[at] = chance.choice(b"dsD[{S!.\0\1\xff" + bytes([chance.randrange(256)]))
-            elif kind < 0.85:
-                del data[at : at + chance.randint(1, 9)]
-            else:
-                data[at:at] = chance.choice(documents())
-            data = data or bytearray(b"[")
-        made.append(bytes(data))
-    return made
-
-
 SCRIPT = r"""
 file = fopen('documents');
 slowest = 0;
@@ -315,8 +290,8 @@ printf('%g %s\n', slowest, regexp(status, 'VmHWM:\s*(\d+)', 'tokens'){1}{1});
 
 @pytest.mark.parametrize(
     ("answers", "expected"),
-    [(CRAFTED, {"genomix:connection"}), (GOOD, {"good"}), (mutants(250), {"good", "genomix:connection"})],
-    ids=["crafted", "good", "mutants"],
+    [(CRAFTED, {"genomix:connection"}), (GOOD, {"good"})],
+    ids=["crafted", "good"],
 )
 def test_answers(tmp_path: Path, answers: list[bytes], expected: set[str]) -> None:
     """Each, as cells and as matrices, has the expected result, quickly and without much memory."""

@@ -344,13 +344,12 @@ def test_a_missing_element_is_not_logged_by_the_node(world: World) -> None:
         for element in ("dummyName", "filterbank_0", "FILTERBANK_0", "a/b"):
             with pytest.raises(HttpError, match="has no element"):
                 world.http.call(f"quiet/gammatonePort/{element}")
-        script = """
+        assert world.lines("""
             set g [genomix::connect $address]
             $g load rosAFE -i quiet
             set request [::quiet::preProcPort dummyName &]
             show [$request wait]
-        """
-        assert world.lines(script) == ["error"]
+        """) == ["error"]
         assert node.complaints == ""
 
 

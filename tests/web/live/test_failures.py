@@ -126,17 +126,20 @@ def test_an_exception_while_answering_closes_the_connection_with_its_reason(worl
 @pytest.mark.parametrize(
     ("data", "code", "reason"),
     [
-        ("nonsense", 1003, "expected a request with id and do"),
+        *(
+            (text, 1003, "expected a request with id and do")
+            for text in ("nonsense", "[]", '{"id": 1}', '{"id": "x", "do": "look"}', "[" * 50_000)
+        ),
         (b"bytes", 1003, "expected a request as text, got bytes"),
         (None, 1007, "expected a text in UTF-8"),
     ],
-    ids=["text", "bytes", "encoding"],
+    ids=["text", "list", "half", "number", "deep", "bytes", "encoding"],
 )
 def test_a_malformed_request_closes_the_connection_with_a_reason(
     world: World, data: str | bytes | None, code: int, reason: str
 ) -> None:
     async def scenario() -> tuple[int | None, Any]:
-        async with page(world.live) as client:
+        async with page(world.live) as client, page(world.live) as other:
             if isinstance(data, str):
                 await client.socket.send_str(data)
             elif data is not None:
@@ -145,7 +148,9 @@ def test_a_malformed_request_closes_the_connection_with_a_reason(
                 writer: Any = client.socket._writer
                 send = getattr(writer, "send_frame", None) or writer._send_frame  # Debian 12's version has the second
                 await send(b"\xff", aiohttp.WSMsgType.TEXT)
-            return await closing_frame(client)
+            closed = await closing_frame(client)
+            assert "unknown request" in (await other.request("explode"))["error"]
+            return closed
 
     assert asyncio.run(scenario()) == (code, reason)
 

@@ -138,23 +138,6 @@ def test_the_error_without_a_master_names_roscore(graph: Graph) -> None:
     assert done.returncode == 1 and done.stderr.count("\n") == 1 and "roscore" in done.stderr
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["no JSON", "[]", '{"id": 1}', '{"id": "x", "do": "look"}', "[" * 50_000],
-    ids=["text", "list", "half", "number", "deep"],
-)
-def test_a_malformed_request_closes_only_its_own_connection(world: World, text: str) -> None:
-    async def scenario() -> None:
-        async with page(world.live) as bad, page(world.live) as good:
-            await bad.socket.send_str(text)
-            with pytest.raises(ConnectionError):
-                while True:
-                    await bad.receive()
-            assert "unknown request" in (await good.request("explode"))["error"]
-
-    asyncio.run(scenario())
-
-
 # --- plots ---
 
 
