@@ -483,7 +483,7 @@ class ReceivedSource(ReceivedSound):
 
     def _fail(self, problem: ComponentError) -> None:
         """End the stream with an error, or let `begin` raise it."""
-        if self._order is None:
+        if not self._begun:
             self._failure = problem
         else:
             self.end(problem.reason.removeprefix(f"{self.name}: "))
@@ -530,7 +530,7 @@ class ReceivedSource(ReceivedSound):
             samples = None if self._size_problem(len(data)) else self._decoded(data)
             start = stamp_ns * 1e-9 if stamp_ns else clock - frames / self._format.rate
             self._append(Received(frames, samples, start, now, self._skipped(number)), bool(stamp_ns))
-            self._last = now, number
+            self._note_message(now, number)
 
     def _unusable(self, data: Any) -> ComponentError | None:
         """Return an error if the stream cannot be used: coded sound, or a first message with a wrong size."""
@@ -538,7 +538,7 @@ class ReceivedSource(ReceivedSound):
         if coded := self._sniff(bytes(data[:4])):
             return device_error(coded)
         problem = self._size_problem(len(data))
-        if problem and self._order is None:
+        if problem and not self._begun:
             return hwparams_error(f"{self.name}: {problem}")
         if problem:
             self._remark("size", f"{problem}; the message counts as lost")
@@ -547,7 +547,6 @@ class ReceivedSource(ReceivedSound):
     def _append(self, message: Received, stamped: bool) -> None:
         if self._order is None:
             self._order = MessageOrder(self.sample_rate, self.STAMP_SLACK if stamped else self.ARRIVAL_SLACK)
-        self._failure = None
         self._put_all(self._order.add(message))
 
     def _put_all(self, messages: Iterator[tuple[int, Received]]) -> None:
@@ -579,6 +578,17 @@ class ReceivedSource(ReceivedSound):
             return True
         self._remark(publisher, f"messages of a second publisher, {publisher}, are not used")
         return False
+
+    @property
+    def _begun(self) -> bool:
+        """Whether a message was used."""
+        return self._last[0] > -math.inf
+
+    def _note_message(self, now: float, number: int | None = None) -> None:
+        """Note that a message is used."""
+        self._last = now, number
+        self._failure = None
+        self.arrived.notify_all()
 
     def _remark(self, kind: str, text: str) -> None:
         """Make a remark once."""
@@ -638,14 +648,15 @@ class ReceivedSource(ReceivedSound):
             ``::bass::e_device`` if none arrives or the sound is coded, ``::bass::e_hwparams`` if its format cannot be
             used.
         """
-        self.wait(lambda: self._order or self._failure, seconds)
+        self.wait(lambda: self._begun or self._failure, seconds)
         if self._failure is not None:
             raise self._failure
         if self._stopping.is_set():
             raise device_error(f"{self.name}: stopped before the first message arrived")
-        advice = "start the driver"
+        if self._begun:
+            return
+        advice = "start the driver, or call Acquire of its bass"
         if self._format is None and not absent:
-            absent = "its format is not known: no AudioInfo has arrived"
-            advice = "add ?format=S16LE&rate=16000&of=2 with the driver's values"
-        if self._order is None:
-            raise device_error(f"{self.name}: {absent or 'no message has arrived'}; {advice}")
+            absent = "no message in a known format has arrived"
+            advice = "without AudioInfo, add ?format=S16LE&rate=16000&of=2 with the driver's values"
+        raise device_error(f"{self.name}: {absent or 'no message has arrived'}; {advice}")
