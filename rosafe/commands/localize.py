@@ -46,8 +46,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--head",
         metavar="FILE",
-        help="SOFA file, a model that `rosafe head learn` has written, or pair:SPACING, two microphones with a distance "
-        "in m and without a head (default: a sphere); sphere and pair cannot distinguish front from back",
+        help="SOFA file, a model that `rosafe head learn` has written, or pair:SPACING, two microphones without a head "
+        "and their distance in m (default: a sphere); sphere and pair cannot distinguish front from back",
     )
     add_mirror(parser)
     parser.add_argument(

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import math
 import os
 import warnings
-from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
 
@@ -48,8 +46,6 @@ class Head:
         Of the responses, Hz.
     front_only : bool
         Whether the responses cover the front half only.
-    computed : callable, optional
-        Called with a sample rate in Hz; returns the filters, with equal ones for the front and the back.
     spacing : float, optional
         Of two microphones without a head, m.
 
@@ -76,7 +72,6 @@ class Head:
         responses: FloatArray | None,
         sample_rate: float,
         front_only: bool = False,
-        computed: Callable[[float], HeadFilters] = sphere_filters,
         spacing: float | None = None,
     ) -> None:
         self.name = name
@@ -84,7 +79,6 @@ class Head:
         self.front_only = front_only
         self.spacing = spacing
         self._responses = responses
-        self._computed = computed
         self._rate = sample_rate
         self._filters: dict[float, HeadFilters] = {}  # by sample rate; replaced, not modified: threads may share it
 
@@ -123,9 +117,7 @@ class Head:
                 f"spacing: expected a distance of the microphones from {MIN_SPACING:g} to {MAX_SPACING:g} m, "
                 f"got {short_repr(spacing)}"
             )
-        spacing = float(spacing)
-        filters = functools.partial(pair_filters, spacing)
-        return cls(f"{PREFIX}{spacing:g}", angles.grid(), None, _CUE_RATE, computed=filters, spacing=spacing)
+        return cls(f"{PREFIX}{spacing:g}", angles.grid(), None, _CUE_RATE, spacing=float(spacing))
 
     @classmethod
     def from_sofa(cls, path: str | os.PathLike[str], mirror: bool | None = None) -> Head:
@@ -218,7 +210,7 @@ class Head:
 
     def _make_filters(self, sample_rate: float) -> HeadFilters:
         if self._responses is None:
-            return self._computed(sample_rate)
+            return sphere_filters(sample_rate) if self.spacing is None else pair_filters(self.spacing, sample_rate)
         ratio = Fraction(sample_rate / self._rate).limit_denominator(1000)
         responses = self._responses
         numbers = math.ceil(responses.size * ratio)

@@ -47,7 +47,7 @@ _MAX_SAME = 4  # blocks of a bin that count: more of one direction are no more e
 _GAIN_DB, _SLOPE = 1.5, 50.0  # standard deviations before the sound is known: of the gain, and of the slope in dB/ms
 _ITERATIONS = 4  # of the regression, until its spread is known
 _MIN_PAIRS, _MIN_PAIRED = 8, 0.2  # blocks with another at the opposite side: number, and part of all
-_DELAY_QUANTILE, _DELAY_TOLERANCE, _DELAY_SLACK = 0.9, 1.15, 0.05  # of the largest delay; slack in ms
+_DELAY_QUANTILE, _DELAY_TOLERANCE, _DELAY_SLACK = 0.9, 1.05, 0.04  # of the largest delay; slack in ms
 
 
 class _Block(NamedTuple):
@@ -171,7 +171,7 @@ class HeadCheck:
         return HeadReport(slope, error, gain, longest, _first_side(lags, longest), problem)
 
     def _problem(self, slope: float, error: float, gain: float, longest: float, both_sides: bool) -> str:
-        without_head = abs(slope) + 2 * error < HEAD_SLOPE
+        without_head = (slope if both_sides else abs(slope)) + 2 * error < HEAD_SLOPE
         spacing = f"{PREFIX}{longest / 1000 * SPEED_OF_SOUND:.2g}"
         if both_sides and slope + 2 * error < -HEAD_SLOPE:
             return (
