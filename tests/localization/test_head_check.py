@@ -70,7 +70,7 @@ def test_microphones_without_a_head(sphere_model: Path, spacing: float, drr_db: 
     assert report.problem.startswith(
         "no level differences at high frequencies: these are microphones without a head; use"
     )
-    assert "--head pair:SPACING" in report.problem and abs(report.slope) < 1
+    assert "--head pair:SPACING" in report.problem and abs(report.slope) < 1.5
     if drr_db is None:
         assert report.max_lag == pytest.approx(1000 * spacing / 343, abs=0.03)
 
