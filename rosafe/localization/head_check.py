@@ -281,7 +281,7 @@ def _expected(model: DirectionModel, low: NDArray[np.bool_], high: NDArray[np.bo
         (model.ild_table, cues.ILD_BINS, cues.MAX_ILD, high),
     ):
         classes = table[:-1].reshape(model.channels, cues.COHERENCE_CLASSES, cues.LEVEL_CLASSES, bins, -1)
-        evidence = np.maximum(classes[channels, 0, cues.LEVEL_CLASSES // 2 :].mean(axis=(0, 1)), 0.0)
+        evidence = np.maximum(classes[channels, 0, cues.LEVEL_CLASSES // 2 :].sum(axis=(0, 1)), 0.0)
         centers = ((np.arange(bins) + 0.5) / bins * 2 - 1) * limit
         differences.append(np.abs(centers @ evidence / np.maximum(evidence.sum(axis=0), 1e-9)).max())
     return float(differences[0]), bool(differences[1] > MIN_LEVEL_DIFFERENCE)

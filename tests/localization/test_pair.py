@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import rosafe
+from rosafe.commands.__main__ import main
 from rosafe.commands.setup import _absolute
 from rosafe.localization import angles, training
 from rosafe.localization.direction_model import DirectionModel
@@ -83,7 +84,14 @@ def test_scenes_setups_and_the_node_know_pairs(tmp_path: Path) -> None:
         "head": "pair:0.2",
         "noise": str(tmp_path / "a.json"),
     }
-    assert Models(LocalizerSettings(head="pair:0.2"))._head.spacing == 0.2
+    assert getattr(Models(LocalizerSettings(head="pair:0.2"))._head, "spacing", None) == 0.2
+
+
+def test_the_command_learns_a_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "SOUND_SECONDS", 5.0)
+    path = tmp_path / "pair.head"
+    assert main(["head", "learn", "pair:0.1", "-o", str(path), "--rate", "16000"]) == 0
+    assert DirectionModel.load(path).head == rosafe.Head.pair(0.1).key
 
 
 @pytest.fixture(scope="module")
@@ -102,5 +110,5 @@ def test_directions_of_a_narrow_pair(pair_model: DirectionModel, tmp_path: Path)
     for azimuth in (-60.0, -20.0, 0.0, 35.0, 60.0, 150.0):
         ears = rosafe.Head.pair(0.058).render(modulated(1.0, 3), RATE, azimuth) * np.array([[1.0], [0.7]])
         ears += 0.005 * np.random.default_rng(4).standard_normal(ears.shape)
-        found = rosafe.localize(ears, RATE, model, 1.0)
+        found = rosafe.localize(ears, RATE, tmp_path / "pair.head", 1.0)
         assert abs(found["azimuth"][-1] - angles.lateral(azimuth)) <= 5, azimuth
