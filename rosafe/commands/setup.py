@@ -98,7 +98,7 @@ def read_file(name: str) -> Setup:
 def _absolute(localizer: Mapping[str, Any], setup_file: Path) -> dict[str, Any]:
     """Return the settings of the localizer with absolute paths; relative ones are relative to the setup."""
 
-    from rosafe.localization.pair import PREFIX  # of a name that is no path
+    from rosafe.localization.pair import PREFIX  # such names are not paths
 
     def path(value: str) -> str:
         return str((setup_file.parent / Path(value).expanduser()).absolute())

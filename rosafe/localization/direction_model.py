@@ -259,7 +259,7 @@ class Histograms:
             self._count(self.itd[direction], self.ild[direction], part, part.valid)
 
     def add_hum(self, cues: Cues) -> None:
-        """Count the cues of frames of mains hum where it is coherent: elsewhere the noise is louder."""
+        """Count the coherent cues of frames of mains hum: in other frames and channels, noise is louder."""
         heard = cues.valid & (cues.itd_row // (LEVEL_CLASSES * ITD_BINS) % COHERENCE_CLASSES < HUM_CLASSES)
         self._count(self._hum_itd, self._hum_ild, cues, heard)
 

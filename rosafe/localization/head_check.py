@@ -43,9 +43,9 @@ _MIN_SPAN = 0.1  # ms, of the time differences: in those of one direction, only 
 _BIN = 0.05  # ms: blocks with equal time differences count as one measurement
 _SPREAD_DB = 0.2  # of the level difference of a block without a head
 _MIN_SAME = 2  # blocks of a bin
-_MAX_SAME = 4  # blocks of a bin that count: more of one direction are no more evidence
-_GAIN_DB, _SLOPE = 1.5, 50.0  # standard deviations before the sound is known: of the gain, and of the slope in dB/ms
-_ITERATIONS = 4  # of the regression, until its spread is known
+_MAX_SAME = 4  # blocks of a bin that count: more of one direction add no evidence
+_GAIN_DB, _SLOPE = 1.5, 50.0  # standard deviations of gain and slope (dB/ms) before the sound is known
+_ITERATIONS = 4  # until the spread of the regression is known
 _MIN_PAIRS, _MIN_PAIRED = 8, 0.2  # blocks with another at the opposite side: number, and part of all
 _DELAY_QUANTILE, _DELAY_TOLERANCE, _DELAY_SLACK = 0.9, 1.05, 0.04  # of the largest delay; slack in ms
 
@@ -59,7 +59,7 @@ class _Block(NamedTuple):
 
 
 class HeadReport(NamedTuple):
-    """The result: NaN for what the sound does not show.
+    """The result; values that the sound does not determine are NaN.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Heads that do not belong to the sound are noticed, from a walk around; other heads and rooms are no reason."""
+"""Heads that do not belong to the sound are noticed, from a walk around; rooms and other heads cause no alarm."""
 
 from __future__ import annotations
 
