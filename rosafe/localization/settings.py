@@ -12,8 +12,7 @@ from typing import Any
 from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import short_repr
 from rosafe.localization.direction_model import DirectionModel
-from rosafe.localization.head import Head
-from rosafe.localization.localizer import MAX_SECONDS, SPHERE, find_model
+from rosafe.localization.localizer import MAX_SECONDS, find_model, open_head
 from rosafe.system.terminal import printable
 
 MAX_AUDIO_DELAY = 5.0  # s
@@ -26,7 +25,7 @@ class LocalizerSettings:
     Attributes
     ----------
     head : str
-        `sphere`, or the path of a SOFA file or of a learned model.
+        `sphere`, `pair:` and a spacing in m, or the path of a SOFA file or of a learned model.
     mirror : bool or None
         Of a SOFA file, as of `rosafe.Head.from_sofa`. An empty text is None.
     seconds : float
@@ -126,14 +125,7 @@ class Models:
     def __init__(self, settings: LocalizerSettings) -> None:
         self.report: Callable[[float], None] = lambda part: None  # of the progress
         self._parameters = settings.parameters or None
-        self._head: Any = SPHERE
-        path = os.path.expanduser(settings.head)
-        if path.lower().endswith(".sofa"):
-            self._head = Head.from_sofa(path, settings.mirror)
-        elif settings.mirror is not None:
-            raise ValueError(f"mirror: expected a SOFA file as the head, got {settings.head!r}; unset mirror")
-        elif settings.head != "sphere":
-            self._head = DirectionModel.load(path)
+        self._head = open_head(settings.head, settings.mirror)
 
     def model_for(self, sample_rate: float) -> DirectionModel:
         """Return the model for a sample rate. It is learned if there is none, which takes up to 30 s on two cores."""
