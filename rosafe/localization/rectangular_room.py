@@ -93,12 +93,10 @@ class RectangularRoom:
 
     def largest_distance(self, azimuths: FloatArray) -> float:
         """Return how far (m) a source may be from the head at all `azimuths` (degrees, in the world)."""
-        distance = np.inf
-        for direction, at, side in zip((np.cos, np.sin), self.head, self.size, strict=False):
-            way = direction(np.radians(azimuths))
-            free = np.where(way > 0, side - MARGIN - at, at - MARGIN)
-            distance = min(distance, float(np.min(free / np.maximum(np.abs(way), 1e-9))))
-        return distance
+        ways = np.stack((np.cos(np.radians(azimuths)), np.sin(np.radians(azimuths))), axis=1)
+        head, size = np.array(self.head[:2]), np.array(self.size[:2])
+        free = np.where(ways > 0, size - MARGIN - head, head - MARGIN)
+        return float(np.min(free / np.maximum(np.abs(ways), 1e-9)))
 
 
 class RoomReflections:
