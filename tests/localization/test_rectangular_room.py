@@ -40,7 +40,7 @@ def test_the_sound_decays_with_the_reverberation_time(size: tuple[float, ...], r
     reflections = RoomReflections(RectangularRoom(size, rt60), SPHERE, RATE)
     found = []
     for azimuth in (0.0, 70.0, -130.0):
-        energy = np.sum(both(reflections, azimuth, 1.0) ** 2, axis=0)
+        energy = np.sum(both(reflections, azimuth, 0.5) ** 2, axis=0)
         decay = 10 * np.log10(np.cumsum(energy[::-1])[::-1] / np.sum(energy))
         inside = np.flatnonzero((decay < -5) & (decay > -35))
         found.append(-60 / np.polyfit(inside / RATE, decay[inside], 1)[0])
