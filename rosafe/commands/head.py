@@ -25,7 +25,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "                         [--set NAME=VALUE ...] [--force]"
     )
     parser.add_argument("action", type=_action, metavar="learn", help="what to do")
-    parser.add_argument("inputs", nargs="*", metavar="SOURCE", help="SOFA file, or CSV file with a list of recordings")
+    parser.add_argument(
+        "inputs", nargs="*", metavar="SOURCE", help="SOFA file, CSV file with a list of recordings, or pair:SPACING"
+    )
     parser.add_argument("-o", "--to", dest="to", metavar="FILE", required=True, help="the model")
     parser.add_argument(
         "--rate",
@@ -55,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
     target = Path(options.to)
     check_target(target, options.force)
     from rosafe.audio.files.audiofile import AudioFileError
-    from rosafe.localization.head import Head
+    from rosafe.localization.head import Head, computed_head
     from rosafe.localization.model_cache import terminal_progress
     from rosafe.localization.recordings import learn_recordings
     from rosafe.localization.training import learn_head
@@ -68,8 +70,9 @@ def run(options: argparse.Namespace) -> int:
                 raise ValueError(f"--mirror: expected a SOFA file, got {source}")
             model = learn_recordings(source, options.rate, parameters, progress)
         else:
+            head = None if options.mirror is not None else computed_head(source)
             model = learn_head(
-                Head.from_sofa(source, options.mirror), float(options.rate or _RATE), parameters, progress
+                head or Head.from_sofa(source, options.mirror), float(options.rate or _RATE), parameters, progress
             )
         if progress:
             progress(1.0)

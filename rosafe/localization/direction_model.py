@@ -46,6 +46,8 @@ WINDOW = 100  # frames for which a floor is estimated while learning
 _SMOOTHING = 0.75  # bins, along ITD and ILD
 _CLASS_SMOOTHING = 0.5  # classes
 _PRIOR_COUNT = 10.0  # frames that the distribution over all directions counts for
+HUM_PART = 1.0  # frames of hum for each one of sound
+HUM_CLASSES = 4  # of coherence, in which hum is counted: independent noise is below
 MAX_GAIN_DB = 1000.0
 MAX_LOG_RATIO = 100.0
 
@@ -65,6 +67,8 @@ class DirectionModel:
         Of the representations, by the names of docs/parameters.md.
     is_sphere : bool
         Whether front and back are equal.
+    max_itd : float
+        Limit of the histogram of the ITD, s.
     level_gain_db : float
         Level of a sound in dB full scale less that of the ratemap summed over ears and channels.
     itd_table, ild_table : ndarray of float32, (rows + 1, A)
@@ -77,6 +81,7 @@ class DirectionModel:
         self.parameters = dict(description["parameters"])
         self.head = str(description["head"])
         self.is_sphere = bool(description["is_sphere"])
+        self.max_itd = float(description.get("max_itd", cues.MAX_ITD))
         self.level_gain_db = float(description["level_gain_db"])
         # Half precision, as in files, so that a learned and a loaded model give the same numbers.
         self.itd_table = np.asarray(itd_table, np.float16).astype(np.float32, order="C")
@@ -145,6 +150,7 @@ class DirectionModel:
             "parameters": self.parameters,
             "head": self.head,
             "is_sphere": self.is_sphere,
+            "max_itd": self.max_itd,
             "level_gain_db": self.level_gain_db,
         }
         with new_file(path, replace) as descriptor, open(descriptor, "wb", closefd=False) as file:
@@ -193,6 +199,7 @@ def _checked_description(found: Any) -> dict[str, Any]:
     """Return the description in a file with the number of `channels`; ValueError unless learning could write it."""
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise ValueError(f"expected the format {FORMAT!r}")
+    found.setdefault("max_itd", cues.MAX_ITD)
     for key, fits in _DESCRIPTION.items():
         if key not in found or not fits(found[key]):
             raise ValueError(f"{key}: expected another value, got {short_repr(found.get(key))}")
@@ -213,6 +220,7 @@ _DESCRIPTION: dict[str, Callable[[Any], bool]] = {
     "parameters": lambda found: isinstance(found, dict),
     "head": lambda found: isinstance(found, str),
     "is_sphere": lambda found: isinstance(found, bool),
+    "max_itd": lambda found: is_number(found) and 0 < found <= 1,
     "level_gain_db": lambda found: is_number(found) and abs(found) <= MAX_GAIN_DB,
 }
 
@@ -241,15 +249,26 @@ class Histograms:
         self._shape = channels, COHERENCE_CLASSES, LEVEL_CLASSES
         self.itd = np.zeros((directions, *self._shape, ITD_BINS), np.float32)
         self.ild = np.zeros((directions, *self._shape, ILD_BINS), np.float32)
+        self._hum_itd = np.zeros((1, *self._shape, ITD_BINS), np.float32)
+        self._hum_ild = np.zeros((1, *self._shape, ILD_BINS), np.float32)
 
     def add(self, direction: int, cues: Cues) -> None:
         """Count the cues of successive frames from one direction; floors are those of windows of `WINDOW` frames."""
         for begin in range(0, max(1, len(cues.level) - WINDOW // 2), WINDOW):
             part = cues.select(slice(begin, begin + WINDOW))
-            levels = level_class(part.level, floors(part.level))
-            for counts, rows, bins in ((self.itd, part.itd_row, ITD_BINS), (self.ild, part.ild_row, ILD_BINS)):
-                flat = counts[direction].reshape(-1)
-                flat += np.bincount((rows + levels * bins)[part.valid], minlength=flat.size).astype(np.float32)
+            self._count(self.itd[direction], self.ild[direction], part, part.valid)
+
+    def add_hum(self, cues: Cues) -> None:
+        """Count the cues of frames of mains hum where it is coherent: elsewhere the noise is louder."""
+        heard = cues.valid & (cues.itd_row // (LEVEL_CLASSES * ITD_BINS) % COHERENCE_CLASSES < HUM_CLASSES)
+        self._count(self._hum_itd, self._hum_ild, cues, heard)
+
+    @staticmethod
+    def _count(itd: np.ndarray, ild: np.ndarray, cues: Cues, units: NDArray[np.bool_]) -> None:
+        levels = level_class(cues.level, floors(cues.level))
+        for counts, rows, bins in ((itd, cues.itd_row, ITD_BINS), (ild, cues.ild_row, ILD_BINS)):
+            flat = counts.reshape(-1)
+            flat += np.bincount((rows + levels * bins)[units], minlength=flat.size).astype(np.float32)
 
     def mirror(self, source: NDArray[np.intp]) -> None:
         """Add to each direction d the counts of direction `source[d]` with the ears exchanged."""
@@ -258,20 +277,32 @@ class Histograms:
 
     def tables(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the tables of log-likelihood ratios for ITD and ILD."""
-        return _log_ratios(self.itd), _log_ratios(self.ild)
+        return _log_ratios(self.itd, self._hum_itd), _log_ratios(self.ild, self._hum_ild)
 
 
-def _log_ratios(counts: np.ndarray) -> np.ndarray:
-    """Return log(p(bin | direction) / p(bin)) of counts (A, C, K, S, bins) as (C * K * S * bins + 1, A)."""
-    smooth = counts
-    for axis, width in ((2, _CLASS_SMOOTHING), (3, _CLASS_SMOOTHING), (4, _SMOOTHING)):
-        smooth = gaussian_filter1d(smooth, width, axis=axis, mode="nearest")
+def _log_ratios(counts: np.ndarray, hum: np.ndarray) -> np.ndarray:
+    """Return log(p(bin | direction) / p(bin)) of counts (A, C, K, S, bins) as (C * K * S * bins + 1, A).
+
+    The ratio is weighted with the probability that the cues are not those of hum, which has counts (1, C, K, S, bins).
+    """
+    smooth, hum = _smoothed(counts), _smoothed(hum)[0]
     mean = smooth.sum(axis=0) + 1e-4
+    hum = HUM_PART * hum * (mean.sum() / max(float(hum.sum()), 1.0))
+    sound = mean / (mean + hum)
     mean /= mean.sum(axis=-1, keepdims=True)
     total = smooth.sum(axis=-1, keepdims=True) + _PRIOR_COUNT
     smooth += _PRIOR_COUNT * mean
     smooth /= total
     smooth /= mean
+    smooth -= 1.0
+    smooth *= sound
+    smooth += 1.0
     table = np.zeros((mean.size + 1, len(counts)), np.float32)
     np.log(smooth.reshape(len(counts), -1).T, out=table[:-1])
     return table
+
+
+def _smoothed(counts: np.ndarray) -> np.ndarray:
+    for axis, width in ((2, _CLASS_SMOOTHING), (3, _CLASS_SMOOTHING), (4, _SMOOTHING)):
+        counts = gaussian_filter1d(counts, width, axis=axis, mode="nearest")
+    return counts

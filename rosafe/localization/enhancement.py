@@ -155,7 +155,7 @@ class _Enhancer:
         if not self._view.shape[1]:
             return np.empty((model.channels, 0))
         features = process(self._view, self._rate, parameters=self._values(), outputs=list(cues.KINDS), pad=True)
-        quantized = cues.quantize(features, cues.scaling_db(model.parameters))
+        quantized = cues.quantize(features, cues.scaling_db(model.parameters), model.max_itd)
         mask = np.empty((model.channels, len(quantized.level)))
         for begin in range(0, mask.shape[1], WINDOW):
             frames = slice(begin, begin + WINDOW)

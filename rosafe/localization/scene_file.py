@@ -10,7 +10,7 @@ from typing import Any
 
 from rosafe.audio.files.audiofile import AudioFileError
 from rosafe.declarations.text import short_repr
-from rosafe.localization.head import Head
+from rosafe.localization.head import Head, computed_head
 from rosafe.localization.rectangular_room import (
     MAX_DRR,
     MAX_RT60,
@@ -140,11 +140,14 @@ class _SceneReader:
             values = {name: value for name, _, value in node.members(what, ("file", "mirror"))}
             mirror = _flag(values["mirror"], f"{what}: mirror") if "mirror" in values else None
             node, what = values.get("file", YamlNode(node.line)), f"{what}: file"
-        if node.scalar(what) == "sphere":
-            return Head.sphere()
+        try:
+            if (computed := computed_head(node.scalar(what))) is not None:
+                return computed
+        except ValueError as problem:
+            raise SetupError(node.line, str(problem)) from None
         path = self._path(node, what)
         if not path.lower().endswith(".sofa"):
-            raise SetupError(node.line, f"{what}: expected 'sphere' or a file that ends in .sofa")
+            raise SetupError(node.line, f"{what}: expected 'sphere', 'pair:SPACING' or a file that ends in .sofa")
         return Head.from_sofa(path, mirror)
 
     def _room(self, node: YamlNode, what: str) -> RectangularRoom:
@@ -154,14 +157,14 @@ class _SceneReader:
                 node.line, f"{what}: expected rt60, and either size or drr_db, got {short_repr([*values])}"
             )
         rt60 = _number(MIN_RT60, MAX_RT60)(values["rt60"], f"{what}: rt60")
+        if "drr_db" in values:
+            return RectangularRoom.drawn(
+                rt60, _number(MIN_DRR, MAX_DRR)(values["drr_db"], f"{what}: drr_db"), self._seed
+            )
+        size = values["size"].items or (values["size"],)
+        sides = tuple(_number(MIN_SIDE, MAX_SIDE)(side, f"{what}: size") for side in size)
         try:
-            if "drr_db" in values:
-                drr_db = _number(MIN_DRR, MAX_DRR)(values["drr_db"], f"{what}: drr_db")
-                return RectangularRoom.drawn(rt60, drr_db, self._seed)
-            sides = values["size"].items or (values["size"],)
-            return RectangularRoom(tuple(_number(MIN_SIDE, MAX_SIDE)(side, f"{what}: size") for side in sides), rt60)
-        except SetupError:
-            raise
+            return RectangularRoom(sides, rt60)
         except ValueError as problem:
             raise SetupError(node.line, f"{what}: {problem}") from None
 

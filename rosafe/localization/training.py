@@ -18,6 +18,7 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles, cues
 from rosafe.localization.direction_model import DirectionModel, Histograms
 from rosafe.localization.head import Head
+from rosafe.localization.hum import hum_sounds
 from rosafe.processing.process import process
 
 SNR_DB = (30.0, 20.0, 12.0, 6.0, 2.0, -2.0, -6.0)
@@ -50,6 +51,7 @@ def learn_head(
     progress : callable, optional
         Called with the part that is done, from 0 to 1.
     """
+    head.check_delay(cues.describe(sample_rate, parameters)["parameters"]["cc_maxDelaySec"])
     filters = head.filters(sample_rate)
     directions = angles.grid()
     symmetric = head.is_symmetric()
@@ -82,7 +84,7 @@ def learn_head(
                 progress((number + 1) / (len(directions) + 1))
 
     grid = angles.grid()
-    histograms, description = count(sounds(), sample_rate, parameters, grid, head.key)
+    histograms, description = count(sounds(), sample_rate, parameters, grid, head.key, cues.max_itd(head.spacing))
     if head.front_back_equal:
         behind = np.abs(grid) > 90
         source = _indices(grid, np.where(grid >= 0, 180 - grid, -180 - grid))
@@ -101,6 +103,7 @@ def count(
     parameters: Mapping[str, Any] | None,
     azimuths: FloatArray,
     key: str,
+    max_itd: float = cues.MAX_ITD,
 ) -> tuple[Histograms, dict[str, Any]]:
     """Count the cues of sounds, pairs of one of `azimuths` and both ears (2, n) with a power of 1 before the head.
 
@@ -114,14 +117,18 @@ def count(
     for azimuth, sound in sounds:
         scaled = sound * _LEVEL
         features = process(scaled, sample_rate, parameters=values, outputs=list(cues.KINDS))
-        quantized = cues.quantize(features, cues.scaling_db(values))
+        quantized = cues.quantize(features, cues.scaling_db(values), max_itd)
         direction = int(np.abs(angles.difference(azimuths, azimuth)).argmin())
         histograms.add(direction, quantized.select(slice(skip, None)))
         powers += np.mean(scaled**2), features["ratemap"].sum(axis=(0, 1)).mean()
+    for sound in hum_sounds(sample_rate):
+        features = process(sound * _LEVEL, sample_rate, parameters=values, outputs=list(cues.KINDS))
+        histograms.add_hum(cues.quantize(features, cues.scaling_db(values), max_itd).select(slice(skip, None)))
     return histograms, {
         "sample_rate": sample_rate,
         "parameters": values,
         "head": key,
+        "max_itd": max_itd,
         "level_gain_db": float(10 * np.log10(powers[0] / powers[1])),
     }
 

@@ -13,9 +13,8 @@ from std_msgs.msg import Bool
 
 from rosafe.declarations.errors import ComponentError
 from rosafe.localization.direction_model import DirectionModel
-from rosafe.localization.head import Head
 from rosafe.localization.live import OK, FixedHead, FrameQueue, LocalizationLoop, Mute, TransformedHead
-from rosafe.localization.localizer import SPHERE, Localizer, find_model
+from rosafe.localization.localizer import Localizer, find_model, open_head
 from rosafe.ros import FrameClock
 from rosafe.ros1.component.state_publisher import Diagnostics
 from rosafe.ros1.localizer.frame_source import PortSource
@@ -144,14 +143,7 @@ class Models:
     def __init__(self, settings: LocalizerSettings) -> None:
         self.report: Callable[[float], None] = lambda part: None  # of the progress
         self._parameters = settings.parameters or None
-        self._head: Any = SPHERE
-        path = os.path.expanduser(settings.head)
-        if path.lower().endswith(".sofa"):
-            self._head = Head.from_sofa(path, settings.mirror)
-        elif settings.mirror is not None:
-            raise ValueError(f"mirror: expected a SOFA file as the head, got {settings.head!r}; unset mirror")
-        elif settings.head != "sphere":
-            self._head = DirectionModel.load(path)
+        self._head = open_head(settings.head, settings.mirror)
 
     def model_for(self, sample_rate: float) -> DirectionModel:
         """Return the model for a sample rate. It is learned if there is none, which takes up to 30 s on two cores."""
