@@ -125,7 +125,7 @@ class SceneDescription:
                 if source.distance > (largest := self.room.largest_distance(course)):
                     raise ValueError(
                         f"{source.name}: distance: expected at most {largest:.2f} m in this room, "
-                        f"got {source.distance:g}"
+                        f"got {source.distance:g}; set the distance of the source, or a larger room"
                     )
         for source in self.sources if self.head.front_only else ():
             times = np.unique((*source.azimuth.times, *self.head_yaw.times))
