@@ -35,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--head",
         metavar="FILE",
         default="sphere",
-        help="SOFA file, or a model that `rosafe head learn` has written (default: a sphere)",
+        help="SOFA file, a model that `rosafe head learn` has written, or pair:SPACING in m (default: a sphere)",
     )
     add_mirror(parser)
     parser.add_argument("-o", "--to", dest="to", metavar="OUT.wav", required=True, help="the enhanced sound")

@@ -1,5 +1,6 @@
 """Learn the model of a head once, for `rosafe localize --head FILE`, from a SOFA file or from recordings.
 
+pair:SPACING, such as pair:0.058, is two microphones with this distance in m and without a head.
 RECORDINGS.csv has the columns file, azimuth_deg: sound files with two ears of one source at a known direction each,
 left positive. The directions must surround the head, at most 30 degrees apart; several files for one direction are
 allowed."""
@@ -21,7 +22,7 @@ _RATE = 44100
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
-        "rosafe head learn HEAD.sofa|RECORDINGS.csv -o FILE [--rate HZ] [--[no-]mirror]\n"
+        "rosafe head learn HEAD.sofa|RECORDINGS.csv|pair:SPACING -o FILE [--rate HZ] [--[no-]mirror]\n"
         "                         [--set NAME=VALUE ...] [--force]"
     )
     parser.add_argument("action", type=_action, metavar="learn", help="what to do")

@@ -37,6 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.usage = (
         "rosafe localize SOUND [--head FILE] [--[no-]mirror] [--seconds S] [--yaw FILE.csv]\n"
         "                       [-o OUT.csv|.json|.png] [--channels L,R] [--set NAME=VALUE ...] [--force]\n"
+        "       rosafe localize [SOUND] --check [SECONDS] [--head FILE]\n"
         "       rosafe localize [--head FILE] [--[no-]mirror] [--seconds S] [--world-frame NAME] [--head-frame NAME]\n"
         "                       [--rosafe NAME] [--connect TOPIC] [--set NAME=VALUE ...] [--name NAME] [-b] [--wait]\n"
         "                       [NAME:=VALUE ...]"
@@ -45,8 +46,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--head",
         metavar="FILE",
-        help="SOFA file, or a model that `rosafe head learn` has written (default: a sphere, which cannot distinguish "
-        "front from back)",
+        help="SOFA file, a model that `rosafe head learn` has written, or pair:SPACING, two microphones with a distance "
+        "in m and without a head (default: a sphere); sphere and pair cannot distinguish front from back",
     )
     add_mirror(parser)
     parser.add_argument(
@@ -75,6 +76,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  rosafe localize scene.wav --head kemar.head --yaw scene.truth.csv -o scene.csv -o scene.png\n"
         "  rosafe localize --head robot.head --world-frame world --audio-delay 0.03    # the node\n"
         "  rosafe localize --head robot.head --check                                   # are the ears swapped?\n"
+        "  rosafe localize walk.wav --head robot.head --check                          # is it the right head?\n"
         "  rosafe localize --head robot.head --calibrate-noise 10                      # fans and motors only"
     )
 
@@ -113,8 +115,12 @@ def _add_node(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--check",
-        action="store_true",
-        help="ask for sounds from three directions, report swapped or silent ears, and end",
+        nargs="?",
+        const=True,
+        type=_check_seconds,
+        metavar="SECONDS",
+        help="check whether the ears are right and the cues belong to the head, and end: with sounds from three "
+        "directions, with ordinary sound of SECONDS, or with a recording SOUND",
     )
     group.add_argument(
         "-i", "--name", dest="instance", metavar="NAME", default="localizer", help="name of the node (localizer)"
@@ -128,9 +134,41 @@ def _add_node(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Localize and write the results."""
     inputs = [*options.inputs, *options.more_inputs]
+    if isinstance(options.check, str):  # a file after --check
+        inputs.append(options.check)
     if len(inputs) > 1:
         options.usage_error(f"SOUND: expected one file, got {len(inputs)}")
-    return _localize(inputs[0], options) if inputs else _run_node(options)
+    if not inputs:
+        return _run_node(options)
+    return _check_file(inputs[0], options) if options.check else _localize(inputs[0], options)
+
+
+def _check_seconds(text: str) -> float | str:
+    """Return the value of --check in s, or the name of a sound file that follows."""
+    try:
+        float(text)
+    except ValueError:
+        return text
+    return option_types.seconds(1.0, 600.0)(text)
+
+
+def _check_file(path: str, options: argparse.Namespace) -> int:
+    """Check whether the cues of a recording belong to the head."""
+    from rosafe.audio.files.audiofile import AudioFileError
+    from rosafe.localization.head_check import check_sound
+    from rosafe.processing.sounds import read_ears
+
+    try:
+        sound, rate = read_ears(path, options.channels)
+        head = head_of(options.head or "sphere", options.mirror)
+        report = check_sound(sound, rate, head, parameters_of(options.settings) or None)
+    except (AudioFileError, ValueError) as problem:
+        raise CommandError(str(problem)) from None
+    if report is None:
+        raise CommandError(f"{printable(path)}: expected a second of sound from one direction at a time, got less")
+    for line in (*report.lines, *filter(None, [report.problem])):
+        print(line)
+    return 1 if report.problem else 0
 
 
 def _localize(path: str, options: argparse.Namespace) -> int:
@@ -210,7 +248,12 @@ def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
         settings = read_settings(given, f"{rospy.resolve_name(options.instance)}/")
         with FrameListener(settings) as listener:
             if options.check:
-                report = ear_check.check_ears(listener, say)
+                seconds = options.check
+                report = (
+                    ear_check.check_ears(listener, say)
+                    if seconds is True
+                    else ear_check.check_ordinary(listener, seconds, say)
+                )
                 for line in report.lines if report is not None else ():
                     say(line)
                 return 1 if report is None or report.problems else 0

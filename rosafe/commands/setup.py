@@ -98,11 +98,15 @@ def read_file(name: str) -> Setup:
 def _absolute(localizer: Mapping[str, Any], setup_file: Path) -> dict[str, Any]:
     """Return the settings of the localizer with absolute paths; relative ones are relative to the setup."""
 
+    from rosafe.localization.pair import PREFIX  # of a name that is no path
+
     def path(value: str) -> str:
         return str((setup_file.parent / Path(value).expanduser()).absolute())
 
     return {
-        name: path(value) if name in LOCALIZER_FILES and value not in ("", "sphere", "none") else value
+        name: path(value)
+        if name in LOCALIZER_FILES and value not in ("", "sphere", "none") and not value.startswith(PREFIX)
+        else value
         for name, value in localizer.items()
     }
 

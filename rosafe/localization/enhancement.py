@@ -175,7 +175,7 @@ class _Enhancer:
     def enhance(self) -> FloatArray:
         """Return the enhanced sound (2, N)."""
         mask, samples = self.mask(), self._view.shape[1]
-        values = self._values()
+        values = {**self._values(), "pp_bRemoveDC": False}  # the high-pass is for the cues only
         hop = FrameGrid.design(self._rate, "ild", values).hop
         step, context = (-(-round(seconds * self._rate) // hop) for seconds in (_BLOCK_SECONDS, _CONTEXT_SECONDS))
         output = np.empty((2, samples))

@@ -1,7 +1,7 @@
-"""Mains hum, which cheap microphones have equally in both channels: sounds from which a model learns what it looks like.
+"""Mains hum, which cheap microphones have equally in both channels: sounds from which a model learns its cues.
 
-The high-pass of `cues.PARAMETERS` removes a constant offset and attenuates the mains frequency. The cues of the harmonics
-that are left are counted, so that they are evidence for no direction.
+The high-pass of `cues.PARAMETERS` removes a constant offset and attenuates the mains frequency. The cues of the
+harmonics that are left are counted, so that they are evidence for no direction.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.head_check import HeadCheck
 from rosafe.localization.localizer import UPDATE_SECONDS, Localizer
 from rosafe.localization.tracker import Track
 
@@ -31,6 +32,8 @@ SILENCE_SECONDS = 0.5  # without new frames, in addition to a block, until no so
 TIME_SLACK = 0.1  # s by which the time of frames may go back, when the clock of the stream is fitted
 MAX_PAUSE = 2.0  # s between two frames; later ones begin again
 GAP_SECONDS = 0.5  # of lost frames after which localization begins again
+CHECK_SECONDS = 5.0  # between two reports on the head
+CHECK_BLOCKS = 50  # of 0.1 s with sound from one direction, for a report
 _MAX_INTERVALS = 100  # in which the robot speaks
 
 
@@ -441,6 +444,8 @@ class LocalizationLoop:
         self._lock = threading.Lock()  # of the link
         self._source: FrameSource | None = None
         self._localizer: Localizer | None = None
+        self._check: HeadCheck | None = None
+        self._check_due = 0.0
         self._newest = 0.0  # end of the newest frame that was used, clock time in s; 0 before the first one
         self._used_at = 0.0  # when it was used (time.monotonic)
         self._estimate: tuple[Any, Any] = angles.grid(), uniform(angles.grid())
@@ -464,12 +469,13 @@ class LocalizationLoop:
     ) -> None:
         """Use a source of frames, which is opened with a function that it calls for new ones; None: there is none."""
         localizer = self._localizer_for(model) if model is not None else None
+        check = HeadCheck(model) if model is not None else None
         source = open_source(self._arrived.set) if open_source is not None else None
         with self._lock:
             before, self._source = self._source, source
             self._used_at = self._queue.received_at = time.monotonic()
             self._begin_again()
-            self._localizer = localizer
+            self._localizer, self._check = localizer, check
         if before is not None:
             before.close()
         if source is None:
@@ -557,11 +563,25 @@ class LocalizationLoop:
             self._begin_again()
             return False
         self._status.clear("values")
+        self._check_head(used.frames)
         steady = ", ".join(f"{azimuth:.0f}" for azimuth in localizer.noise.azimuths)
         self._status.value("directions of steady noise (degrees)", steady or "none")
         self._estimate = result["azimuths"], result["posterior"][0]
         self._newest, self._used_at = float(result["time"][0]), time.monotonic()
         return True
+
+    def _check_head(self, frames: NewFrames) -> None:
+        """Report every few seconds whether the cues belong to the head."""
+        if self._check is None:
+            return
+        self._check.update(frames.features)
+        if time.monotonic() >= self._check_due:
+            self._check_due = time.monotonic() + CHECK_SECONDS
+            report = self._check.report(CHECK_BLOCKS)
+            if report is not None and report.problem:
+                self._status.set("head", WARN, f"the cues do not fit the head: {report.problem}")
+            else:
+                self._status.clear("head")
 
     def _append(self, new: NewFrames, localizer: Localizer) -> None:
         if new.lost:

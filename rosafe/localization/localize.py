@@ -34,8 +34,9 @@ def localize(
     sample_rate : float
         In Hz.
     head : Head or str or Path
-        `"sphere"`, a head, or the path of a SOFA file or of a model that `rosafe head learn` has written. A model is
-        learned at the first use of a head, sample rate and parameters; this takes up to 30 s.
+        `"sphere"`, `"pair:0.058"` (microphones with this spacing in m), a head, or the path of a SOFA file or of a
+        model that `rosafe head learn` has written. A model is learned at the first use of a head, sample rate and
+        parameters; this takes up to 30 s.
     seconds : float
         Length of the window of integration.
     parameters : mapping, optional

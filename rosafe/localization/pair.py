@@ -26,6 +26,6 @@ def pair_filters(spacing: float, sample_rate: float) -> HeadFilters:
     delays = pair_delays(spacing, azimuths) * sample_rate
     delays += np.ceil(delays.max()) + RINGING
     length = int(2 * delays.max())
-    frequencies = np.fft.rfftfreq(scipy.fft.next_fast_len(2 * length, real=True))
+    frequencies = np.fft.rfftfreq(scipy.fft.next_fast_len(2 * length, real=True), 1.0)
     spectra = band_limit(frequencies) * np.exp(-2j * np.pi * frequencies * delays[..., np.newaxis])
     return HeadFilters(azimuths, np.fft.irfft(spectra)[..., :length], delays)

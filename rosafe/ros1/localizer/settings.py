@@ -24,7 +24,7 @@ class LocalizerSettings:
     Attributes
     ----------
     head : str
-        `sphere`, or the path of a SOFA file or of a learned model.
+        `sphere`, `pair:` and a spacing in m, or the path of a SOFA file or of a learned model.
     mirror : bool or None
         Of a SOFA file, as of `rosafe.Head.from_sofa`. An empty text is None.
     seconds : float

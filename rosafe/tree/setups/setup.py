@@ -16,7 +16,7 @@ from rosafe.tree.tree_planner import ExistingProcessor, ProcessorSpec
 ACQUIRE = BASS.service("Acquire").parameters
 # The settings of the localizer node, which are also its private ROS parameters.
 LOCALIZER = (
-    Parameter("head", "string", "sphere", "Head: sphere, or a SOFA file or a learned model"),
+    Parameter("head", "string", "sphere", "Head: sphere, pair:SPACING (m), a SOFA file or a learned model"),
     Parameter("mirror", "boolean", False, "Whether the labels of a SOFA file exchange left and right"),  # or absent
     Parameter("seconds", "double", 0.5, "Window of integration", minimum=0.01, maximum=60.0, unit="s"),
     Parameter("world_frame", "string", "", "Coordinate frame of the azimuths; empty: the frame of the head"),
