@@ -471,8 +471,8 @@ def section_rooms(run: Map) -> str:
         f"Speech in {len(PLACES)} rectangular rooms, from {len(DIRECTIONS[::EVERY])} directions, {ROOM_SECONDS:g} s "
         "each, estimates from one second. Image sources and a diffuse tail through KEMAR "
         "(rosafe/localization/rectangular_room.py); training uses none of these rooms and no image sources. The "
-        "reflections are scaled to the ratio of direct to reverberant energy. Noise at 60 dB. What these rooms cannot "
-        "show: furniture, walls that absorb some frequencies more than others, talkers that radiate to one side, and "
+        "reflections are scaled to the ratio of direct to reverberant energy. Noise at 60 dB. These rooms lack "
+        "furniture, walls that absorb some frequencies more than others, talkers that radiate to one side, and "
         "elevated reflections with the ears' responses for their elevation (they have those of the horizontal "
         "plane with the same lateral angle). 0 and 180 degrees count as one.\n\n"
         + table("direct-to-reverberant ratio (dB)", RATIOS, rows)

@@ -20,7 +20,7 @@ from rosafe.localization.filters import HeadFilters
 from rosafe.localization.scene_signals import uniform
 from rosafe.localization.sphere import SPEED_OF_SOUND
 
-# Limits of what users give: memory and time are bounded, and formulas hold
+# Limits of the values in scenes: memory and time are bounded, and formulas hold
 MIN_SIDE, MAX_SIDE = 1.0, 30.0  # m
 MIN_RT60, MAX_RT60 = 0.05, 5.0  # s
 MIN_DRR, MAX_DRR = -20.0, 40.0  # dB
@@ -70,7 +70,7 @@ class RectangularRoom:
         return cls(tuple(sides.tolist()), rt60, None, drr_db)
 
     def __post_init__(self) -> None:
-        """Check what the limits of single values do not ensure."""
+        """Check the values together; each alone is within the limits above."""
         if len(self.size) != 3:
             raise ValueError(f"size: expected three sides in m, got {short_repr(self.size)}")
         surface = 2 * sum(self.volume / side for side in self.size)
@@ -93,12 +93,10 @@ class RectangularRoom:
 
     def largest_distance(self, azimuths: FloatArray) -> float:
         """Return how far (m) a source may be from the head at all `azimuths` (degrees, in the world)."""
-        distance = np.inf
-        for direction, at, side in zip((np.cos, np.sin), self.head, self.size, strict=False):
-            way = direction(np.radians(azimuths))
-            free = np.where(way > 0, side - MARGIN - at, at - MARGIN)
-            distance = min(distance, float(np.min(free / np.maximum(np.abs(way), 1e-9))))
-        return distance
+        ways = np.stack((np.cos(np.radians(azimuths)), np.sin(np.radians(azimuths))), axis=1)
+        head, size = np.array(self.head[:2]), np.array(self.size[:2])
+        free = np.where(ways > 0, size - MARGIN - head, head - MARGIN)
+        return float(np.min(free / np.maximum(np.abs(ways), 1e-9)))
 
 
 class RoomReflections:
@@ -151,7 +149,7 @@ class RoomReflections:
         ways = np.stack([np.linalg.norm(self._lattice.offsets(source), axis=1) for source in sources])
         chosen = (ways > reach / 2) & (ways < reach)
         orders, energies = np.broadcast_to(self._lattice.orders, ways.shape)[chosen], ways[chosen] ** -2.0 / len(ways)
-        decay = 6 * np.log(10) / (SPEED_OF_SOUND * room.rt60)  # of the energy, per m
+        decay = 6 * np.log(10) / (SPEED_OF_SOUND * room.rt60)  # per m, energy
         expected = 4 * np.pi / room.volume * (np.exp(-decay * reach / 2) - np.exp(-decay * reach)) / decay
         low, high = 0.0, 1.0
         for _ in range(40):
@@ -195,7 +193,10 @@ class RoomReflections:
         tail = np.zeros((2, begin + len(times) + self._filters.length - 1))
         lateral = np.degrees(np.arcsin((2 * np.arange(TAIL_DIRECTIONS // 2) + 1) / (TAIL_DIRECTIONS // 2) - 1))
         random = np.random.PCG64([self._seed, (1 << 20) + 1])
-        for azimuth in (*lateral, *(180.0 - lateral)):  # of a field that is equal in all directions of space
+        for azimuth in (
+            *lateral,
+            *(180.0 - lateral),
+        ):  # lateral angles are those of a field that is equal from all directions
             noise = envelope * uniform(random, len(times))
             response = self._filters.response(float(angles.wrap(azimuth)))
             tail[:, begin:] += scipy.signal.oaconvolve(noise[np.newaxis], response, axes=-1)

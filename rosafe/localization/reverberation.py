@@ -98,7 +98,7 @@ class _Convolver:
     def __init__(self, response: FloatArray, block: int) -> None:
         self._block = block
         self._response = self._spectra(response)
-        self._inputs = np.zeros((len(self._response), block + 1), complex)  # of the newest blocks; newer before older
+        self._inputs = np.zeros((len(self._response), block + 1), complex)  # newest blocks, newer before older
         self._newest = 0
         self._last = np.zeros(block)
 

@@ -118,14 +118,15 @@ class SceneDescription:
 
     def __post_init__(self) -> None:
         """Raise ValueError if a source is outside the room, or behind a head that covers the front half only."""
-        fixed = self.room is None or self.room.drr_db is not None  # distances do not matter
-        for source in () if fixed else self.sources:
-            values = source.azimuth.at(np.array(source.azimuth.times))
-            largest = self.room.largest_distance(np.arange(values.min(), min(values.max(), values.min() + 360) + 1))
-            if source.distance > largest:
-                raise ValueError(
-                    f"{source.name}: distance: expected at most {largest:.2f} m in this room, got {source.distance:g}"
-                )
+        if self.room is not None and self.room.drr_db is None:
+            for source in self.sources:
+                values = source.azimuth.at(np.array(source.azimuth.times))
+                course = np.arange(values.min(), min(values.max(), values.min() + 360) + 1)
+                if source.distance > (largest := self.room.largest_distance(course)):
+                    raise ValueError(
+                        f"{source.name}: distance: expected at most {largest:.2f} m in this room, "
+                        f"got {source.distance:g}; set the distance of the source, or a larger room"
+                    )
         for source in self.sources if self.head.front_only else ():
             times = np.unique((*source.azimuth.times, *self.head_yaw.times))
             relative = source.azimuth.at(times) - self.head_yaw.at(times)

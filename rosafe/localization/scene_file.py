@@ -157,14 +157,14 @@ class _SceneReader:
                 node.line, f"{what}: expected rt60, and either size or drr_db, got {short_repr([*values])}"
             )
         rt60 = _number(MIN_RT60, MAX_RT60)(values["rt60"], f"{what}: rt60")
+        if "drr_db" in values:
+            return RectangularRoom.drawn(
+                rt60, _number(MIN_DRR, MAX_DRR)(values["drr_db"], f"{what}: drr_db"), self._seed
+            )
+        size = values["size"].items or (values["size"],)
+        sides = tuple(_number(MIN_SIDE, MAX_SIDE)(side, f"{what}: size") for side in size)
         try:
-            if "drr_db" in values:
-                drr_db = _number(MIN_DRR, MAX_DRR)(values["drr_db"], f"{what}: drr_db")
-                return RectangularRoom.drawn(rt60, drr_db, self._seed)
-            sides = values["size"].items or (values["size"],)
-            return RectangularRoom(tuple(_number(MIN_SIDE, MAX_SIDE)(side, f"{what}: size") for side in sides), rt60)
-        except SetupError:
-            raise
+            return RectangularRoom(sides, rt60)
         except ValueError as problem:
             raise SetupError(node.line, f"{what}: {problem}") from None
 

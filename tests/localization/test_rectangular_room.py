@@ -40,7 +40,7 @@ def test_the_sound_decays_with_the_reverberation_time(size: tuple[float, ...], r
     reflections = RoomReflections(RectangularRoom(size, rt60), SPHERE, RATE)
     found = []
     for azimuth in (0.0, 70.0, -130.0):
-        energy = np.sum(both(reflections, azimuth, 1.0) ** 2, axis=0)
+        energy = np.sum(both(reflections, azimuth, 0.5) ** 2, axis=0)
         decay = 10 * np.log10(np.cumsum(energy[::-1])[::-1] / np.sum(energy))
         inside = np.flatnonzero((decay < -5) & (decay > -35))
         found.append(-60 / np.polyfit(inside / RATE, decay[inside], 1)[0])
@@ -52,15 +52,15 @@ def test_the_energy_is_that_of_all_images(size: tuple[float, ...], rt60: float) 
     """All images are listed by a mirror at each wall, until they have decayed by 60 dB."""
     head = np.array(size) * (0.45, 0.4, 0.55)
     reflections = RoomReflections(RectangularRoom(size, rt60, tuple(head)), no_head(), RATE)
-    ratios, distance = [], 1.2
+    ratios, distance = [], 0.6
     for azimuth in (20.0, 160.0):
         source = head + distance * np.array([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), 0.0])
         axes = []
         for side, at, ear in zip(size, source, head, strict=True):
             rooms = np.arange(-int(343 * rt60 / side) - 1, int(343 * rt60 / side) + 2)
             axes.append((np.abs(rooms), side * rooms + np.where(rooms % 2 == 0, at, side - at) - ear))
-        orders = sum(np.ix_(*(axis[0] for axis in axes)))
-        ways = np.sqrt(sum(part**2 for part in np.ix_(*(axis[1] for axis in axes))))
+        orders = np.add.outer(np.add.outer(axes[0][0], axes[1][0]), axes[2][0])
+        ways = np.sqrt(np.add.outer(np.add.outer(axes[0][1] ** 2, axes[1][1] ** 2), axes[2][1] ** 2))
         reflected = (orders > 0) & (ways < 343 * rt60)
         expected = np.sum((reflections.reflection ** orders[reflected] * distance / ways[reflected]) ** 2)
         ratios.append(np.sum(both(reflections, azimuth, distance)[0] ** 2) / expected)
@@ -132,7 +132,7 @@ def test_a_static_source_is_convolved_with_all_its_reflections(tmp_path: Path) -
 def test_reflections_stay_in_the_world_when_the_head_turns(tmp_path: Path) -> None:
     """After the turn, and after a walk, the sound is that of a head and a source that have always been there."""
     text = "room: {{rt60: 0.2, size: [5, 4, 3]}}\nhead_yaw: {}\nsources: [{{signal: noise, azimuth: {}}}]"
-    moved = scene(tmp_path, text.format("[[0, 0], [0.7, 50]]", "[[0, 130], [0.7, 90]]")).frames(3 * RATE)
+    moved = scene(tmp_path, text.format("[[0, 43], [0.7, 50]]", "[[0, 97], [0.7, 90]]")).frames(3 * RATE)
     static = scene(tmp_path, text.format("50", "90")).frames(3 * RATE)
     assert np.abs((moved - static)[:, 2 * RATE :]).max() < 1e-9
     assert np.abs((moved - static)[:, : RATE // 2]).max() > 0.01
@@ -176,5 +176,5 @@ def test_unsuitable_rooms_are_rejected(tmp_path: Path, room: str, message: str) 
 
 def test_a_source_may_be_far_along_the_room(tmp_path: Path) -> None:
     scene(tmp_path, "room: {rt60: 0.4, size: [9, 2, 3]}\nsources: [{signal: noise, azimuth: 180, distance: 4.4}]")
-    with pytest.raises(SceneError, match="source 1: distance: expected a number from 0.2 to 30, got '0'"):
+    with pytest.raises(SceneError, match=r"source 1: distance: expected a number from 0\.2 to 30, got '0'"):
         scene(tmp_path, "room: {rt60: 0.4, size: [9, 2, 3]}\nsources: [{signal: noise, distance: 0}]")

@@ -25,7 +25,7 @@ from rosafe.system.option_types import number, seconds, whole_number
 
 WALK_SECONDS = 10.0
 LEVEL_DB = -30.0
-DRR_DB = 5.0  # of a room
+DRR_DB = 5.0  # in a room
 MIN_RATE = 1000  # Hz; almost no sound would remain below
 _PITCH = (125.0, 25.0, 0.37)  # Hz: mean, excursion and speed of the talker's gliding voice
 _SYLLABLE = 0.25  # s
@@ -47,7 +47,7 @@ class Scene:
     seed : int
         Seed of noise and room.
     rt60 : float, optional
-        Reverberation time of a room around them in s; by default there is no room.
+        Reverberation time of a room in s; without a room by default.
     drr : float
         Direct-to-reverberant ratio in the room, dB.
     """
