@@ -36,7 +36,7 @@ import rosafe
 from rosafe.commands.__main__ import main
 from rosafe.dsp.kernels import build
 from rosafe.localization import training
-from rosafe.ros1.afe.saved_tree import TreeStateFile
+from rosafe.tree.setups.state_file import TreeStateFile
 from rosafe.tree.setups import Setup
 from rosafe.ros1.transport.registration import _user_lock
 

@@ -20,9 +20,9 @@ import pytest
 
 import rosafe
 from rosafe.localization import angles, cues, model_cache, results
+from rosafe.localization import stored_noise as noise
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.noise import NoiseCalibration
-from rosafe.ros1.localizer import noise
 from rosafe.system import trust
 from tests.harness import PYTHON, ROOT
 from tests.localization.test_head import write_sofa

@@ -13,11 +13,13 @@ PACKAGE = ROOT / "rosafe"
 # The library, lowest first: each folder may import those before it.
 LIBRARY = (
     *("system", "declarations", "dsp", "plugin", "representations", "interface", "tree", "tree.setups", "testing"),
-    *("results.view", "audio.files", "results", "processing", "torch", "localization", "audio.devices", "validation"),
+    *("results.view", "audio.files", "results", "processing", "torch", "localization", "audio.devices", "audio.stream"),
+    "validation",
 )
 # A door may import the library, and each of its folders those before it.
 DOORS = {
     "ros1": ("ros1.transport", "ros1.component", "ros1.client", "ros", "ros1.afe", "ros1.bass", "ros1.localizer"),
+    "ros2": ("ros2",),
     "web": ("web.server", "web.genomix", "web.live"),
 }
 CLIENTS = {"ros1.transport", "ros1.component", "ros1.client"}  # the part of another door that `web` may import

@@ -60,7 +60,7 @@ def take_remarks(source: SoundSource) -> list[str]:
     """Return lines for the log about the sound of a source, each once."""
     remarks: list[str] = getattr(source, "remarks", [])
     taken = remarks[:]
-    remarks.clear()
+    del remarks[: len(taken)]  # another thread may append one meanwhile
     return taken
 
 

@@ -23,7 +23,7 @@ from rosafe.interface import KINDS, REQUEST, ROSAFE, ComponentError, Representat
 from rosafe.representations import PLUGINS, PROBLEMS, STAGES, WARNINGS
 from rosafe.ros1.afe import responses
 from rosafe.ros1.afe.audio_input import AudioInput
-from rosafe.ros1.afe.processor_health import ChoiceFallbacks
+from rosafe.ros1.afe.choice_fallbacks import ChoiceFallbacks
 from rosafe.ros1.afe.published_tree import PublishedTree
 from rosafe.ros1.afe.saved_tree import SavedTree
 from rosafe.ros1.afe.trace_port import TracePort

@@ -14,17 +14,18 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.audio.devices import SoundSource, device_lines, open_source
 from rosafe.audio.devices.alsa import AlsaSource, DeviceBusyError
+from rosafe.audio.stream.capture import Capture, Snapshot, check_window
+from rosafe.audio.stream.truth import TruthSource
 from rosafe.interface import BASS, ComponentError
-from rosafe.ros1.bass.capture import Capture, Snapshot, check_window
-from rosafe.ros1.bass.scene_truth import TruthPublisher, TruthSource
+from rosafe.ros1.bass.scene_truth import TruthPublisher
 from rosafe.ros1.bass.socket_server import DEFAULT_HOST, DEFAULT_PORT, DedicatedSocket
 from rosafe.ros1.component import serialization
 from rosafe.ros1.component.activities import Activity
 from rosafe.ros1.component.component import ComponentNode
 from rosafe.ros1.component.startup import run_server
 from rosafe.ros1.transport import master
-from rosafe.ros1.transport.log_throttle import ThrottledLog
 from rosafe.ros1.transport.publisher import Publisher
+from rosafe.system.log_throttle import ThrottledLog
 from rosafe.system.terminal import printable
 
 FRAMES: tuple[str, ...] = ("world", "head")  # default names of coordinate frames

@@ -23,13 +23,13 @@ from rosafe.interface import BLOCK_AND_BUFFERS, REQUEST, ROSAFE, ComponentError,
 from rosafe.localization import cues
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.live import OK, WARN, FrameFormat
+from rosafe.localization.status import NodeStatus
 from rosafe.ros1.client.component_client import ComponentClient
 from rosafe.ros1.client.graph import Graph, NotRegisteredError
 from rosafe.ros1.client.tcpros import ServiceClient, component_exception
 from rosafe.ros1.localizer.created_processors import CreatedProcessors
-from rosafe.ros1.localizer.status import NodeStatus
 from rosafe.ros1.transport import registration
-from rosafe.ros1.transport.log_throttle import ThrottledLog
+from rosafe.system.log_throttle import ThrottledLog
 from rosafe.system.terminal import printable
 from rosafe.tree.tree_planner import ExistingProcessor
 

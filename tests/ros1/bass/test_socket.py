@@ -18,8 +18,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rosafe.audio.stream.capture import Snapshot
 from rosafe.ros1.bass import socket_server
-from rosafe.ros1.bass.capture import Snapshot
 from rosafe.ros1.bass.socket_server import DedicatedSocket, read_frames, take_requests
 from tests.harness import PATIENCE, ROOT, wait_for
 

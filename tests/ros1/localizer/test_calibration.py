@@ -11,8 +11,8 @@ import pytest
 import rosafe
 from rosafe.localization.live import OK
 from rosafe.localization.noise import FORMAT, NoiseCalibration
-from rosafe.ros1.localizer.noise import StoredNoise
-from rosafe.ros1.localizer.status import NodeStatus
+from rosafe.localization.status import NodeStatus
+from rosafe.localization.stored_noise import StoredNoise
 from tests.harness import Graph
 from tests.localization.conftest import RATE
 from tests.ros1.localizer.room import Room

@@ -11,9 +11,9 @@ import pytest
 
 import rosafe
 from rosafe.localization.cues import PARAMETERS
+from rosafe.localization.settings import LocalizerSettings
 from rosafe.ros1.localizer import ear_check, measurement
 from rosafe.ros1.localizer.ear_check import DIRECTIONS, EarReport, HeardSound, assess, check_ears, heard_sound
-from rosafe.ros1.localizer.settings import LocalizerSettings
 from rosafe.ros1.transport import registration
 from tests.harness import Graph, Process, wait_for
 from tests.localization.conftest import RATE, modulated

@@ -8,7 +8,7 @@ from typing import IO
 
 import numpy as np
 
-from rosafe.ros1.bass.capture import AudioWindow
+from rosafe.audio.stream.capture import AudioWindow
 
 HEADER_SECONDS = 1.0  # of sound: the maximum loss of a WAV if the process is killed
 RIFF_LIMIT = 2**32 - 1  # bytes; a longer file is written as RF64

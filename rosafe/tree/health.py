@@ -1,44 +1,89 @@
-"""The state of the processors in /diagnostics: load, failures, slow calls, and choices that were replaced."""
+"""The state of the processors of a node for its diagnostics: load, failures, slow calls."""
 
 from __future__ import annotations
 
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-import rospy
-from diagnostic_msgs.msg import DiagnosticStatus
-
-from rosafe.declarations.parameter import Parameter
 from rosafe.dsp.plugin_checks import plugin_of
-from rosafe.interface.remarks import advice
-from rosafe.ros1.component.activities import TaskStatistics
-from rosafe.ros1.transport import master
-from rosafe.ros1.transport.log_throttle import ThrottledLog
+from rosafe.system.log_throttle import ThrottledLog
 from rosafe.tree.processor import Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Failure, Tree
 
+OK, WARN, ERROR = 0, 1, 2  # levels of diagnostic_msgs/DiagnosticStatus
+LOAD_SECONDS = 1.0  # minimum time over which the load is measured; in less, one cycle would look like overload
 SLOW_SECONDS = 1.0  # a call of a stage is slow if it takes longer than this,
 SLOW_BLOCKS = 10.0  # and longer than this many lengths of its block
 SHOWN_SECONDS = 60.0  # for which a slow call is reported after its end
 FAILED, SLOW = "failed", "slow"  # keys in /diagnostics, before the name of the processor
 NEXT_STEP = "correct it, restart rosAFE if it is a plugin, and request it again"
-STRICT_CHOICES_PARAM = "~strict_words"  # ROS parameter, read for each unknown choice
 LOG_SECONDS = 60.0  # between two lines about one processor
+
+
+class TaskStatistics:
+    """Measurements of one task of the component: number and duration of its cycles, and its load.
+
+    The load is the time spent in cycles divided by the elapsed time. It can exceed 1 if a task has several processors.
+
+    Attributes
+    ----------
+    cycle : callable
+        Count a cycle of some seconds. It may be called from any thread, thousands of times per second.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.load = self.load_max = 0.0
+        self._pending: deque[float] = deque()  # the cycles since the last snapshot, of which there is one per second
+        self.cycle: Callable[[float], None] = self._pending.append
+        self._cycles = 0
+        self._last = self._longest = self._total = self._busy = 0.0
+        self._since = self._start = time.monotonic()
+        self._lock = threading.Lock()
+
+    def _count_pending(self) -> None:
+        for _ in range(len(self._pending)):
+            self._last = self._pending.popleft()
+            self._longest = max(self._longest, self._last)
+            self._total += self._last
+            self._busy += self._last
+            self._cycles += 1
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return the member `rusage` of genom_state: timings in seconds, and the load of about the last second."""
+        with self._lock:
+            self._count_pending()
+            now = time.monotonic()
+            if now - self._since >= LOAD_SECONDS:
+                self.load = self._busy / (now - self._since)
+                self.load_max = max(self.load_max, self.load)
+                self._busy, self._since = 0.0, now
+            average = self._total / self._cycles if self._cycles else 0.0
+            return {
+                "cycles": self._cycles % 2**32,
+                "timings": {"last": self._last, "max": self._longest, "avg": average},
+                "load": {
+                    "last": self.load,
+                    "max": self.load_max,
+                    "avg": self._total / max(now - self._start, 1e-9),
+                },
+            }
 
 
 class SlowCalls:
     """Detects calls of stages that take too long, including those that never return. Safe from any thread."""
 
-    def __init__(self, tree: Tree) -> None:
+    def __init__(self, tree: Tree, warn: Callable[[str], object]) -> None:
         self._tree = tree
         self._lock = threading.Lock()
         self._computing: dict[Processor, tuple[int, float]] = {}  # block, and when it was first seen
         self._found: dict[Processor, tuple[int, float, str]] = {}  # block, when it was last seen, the line
-        self._log = ThrottledLog(rospy.logwarn, LOG_SECONDS)
+        self._log = ThrottledLog(warn, LOG_SECONDS)
 
     def poll(self) -> None:
         """Check all processors. Called about once a second."""
@@ -95,83 +140,30 @@ def _is_slow(processor: Processor, seconds: float) -> bool:
     return seconds > max(SLOW_SECONDS, SLOW_BLOCKS * _block_seconds(processor))
 
 
-class ChoiceFallbacks:
-    """Unknown choices in requests: replaced as in the original, with a warning, or rejected in strict mode.
+class ProcessorHealth:
+    """The part of `/diagnostics` about processors, with their loads.
 
     Parameters
     ----------
-    strict : bool
-        Reject unknown choices, whatever the value of the ROS parameter.
+    tree : Tree
+    warn, error : callable
+        Write a line to the log.
+    unknown_words : callable
+        Returns lines about unknown words that were replaced.
     """
 
-    def __init__(self, strict: bool) -> None:
-        self._strict = strict
-        self._warnings: dict[Processor, dict[str, str]] = {}  # by the name of the parameter
-        self._advised: set[Processor] = set()
-        self._lock = threading.Lock()
+    def __init__(
+        self,
+        tree: Tree,
+        warn: Callable[[str], object],
+        error: Callable[[str], object],
+        unknown_words: Callable[[], list[str]] = list,
+    ) -> None:
+        self._tree, self._error, self._unknown_words = tree, error, unknown_words
+        self._slow = SlowCalls(tree, warn)
+        self._meters: dict[Processor, tuple[TaskStatistics, TaskStatistics | None]] = {}
 
-    def resolving(self, warnings: dict[str, str]) -> Callable[[Parameter, Any], Any]:
-        """Return a function that replaces unknown choices, except in strict mode, and adds a warning to `warnings`."""
-
-        def resolve(parameter: Parameter, value: Any) -> Any:
-            warnings[parameter.name] = warning = parameter.substitution_warning(value)
-            return value if warning and self._is_strict() else parameter.resolve_choice(value)
-
-        return resolve
-
-    def _is_strict(self) -> bool:
-        try:
-            return self._strict or bool(rospy.get_param_cached(STRICT_CHOICES_PARAM, False) == 1)  # true, or 1
-        except master.FAILURES:
-            return False
-
-    def note(self, processor: Processor, warnings: dict[str, str]) -> str:
-        """Log and store the `warnings` about parameters of a processor, and return them as one line."""
-        with self._lock:
-            stored = {**self._warnings.pop(processor, {}), **warnings}
-            if any(stored.values()):
-                self._warnings[processor] = {name: warning for name, warning in stored.items() if warning}
-        lines = [f"{processor.name}: {warning}" for warning in warnings.values() if warning]
-        for line in [*lines, *self._advice(processor)]:
-            rospy.logwarn(line)
-        return "; ".join(lines)
-
-    def _advice(self, processor: Processor) -> list[str]:
-        """Return the declared warning about valid but unsuitable values, once for each processor."""
-        if processor in self._advised:
-            return []
-        with self._lock:
-            self._advised.add(processor)
-        values: dict[str, Any] = {}
-        ancestor: Processor | None = processor
-        while ancestor is not None:
-            values |= ancestor.stage.parameters
-            ancestor = ancestor.parent
-        text = advice(processor.kind, values)
-        return [f"{processor.name}: {text}"] if text else []
-
-    def forget(self, processor: Processor) -> None:
-        """Remove the warnings of a processor that has ended."""
-        with self._lock:
-            self._warnings.pop(processor, None)
-            self._advised.discard(processor)
-
-    @property
-    def lines(self) -> list[str]:
-        """The warnings about the current parameters of all processors."""
-        with self._lock:
-            return [f"{p.name}: {warning}" for p, warnings in self._warnings.items() for warning in warnings.values()]
-
-
-class ProcessorHealth:
-    """The part of `/diagnostics` about processors, with their loads."""
-
-    def __init__(self, tree: Tree, choices: ChoiceFallbacks) -> None:
-        self._tree, self._choices = tree, choices
-        self._slow = SlowCalls(tree)
-        self._meters: dict[Processor, tuple[TaskStatistics, TaskStatistics]] = {}  # its own, and that of its task
-
-    def added(self, processor: Processor, task: TaskStatistics) -> None:
+    def added(self, processor: Processor, task: TaskStatistics | None = None) -> None:
         """Register a processor that is about to start; its computing time is added to that of `task`."""
         self._meters[processor] = TaskStatistics(processor.name), task
 
@@ -180,7 +172,8 @@ class ProcessorHealth:
         meters = self._meters.get(processor)  # None if it has ended
         if meters is not None:
             meters[0].cycle(seconds)
-            meters[1].cycle(seconds)
+            if meters[1] is not None:
+                meters[1].cycle(seconds)
             if seconds > SLOW_SECONDS:
                 self._slow.executed(processor, seconds)
 
@@ -191,18 +184,18 @@ class ProcessorHealth:
         if processor.error is not None:
             failure = next((f for f in self._tree.failures if f.name == processor.name), Failure.of(processor))
             trace = "".join(traceback.format_exception(processor.error.__cause__ or processor.error))
-            rospy.logerr(f"{failure}; {NEXT_STEP}\n{trace}")
+            self._error(f"{failure}; {NEXT_STEP}\n{trace}")
 
     def report(self, status: Any) -> Any:
         """Fill in a status of /diagnostics."""
         self._slow.poll()
-        processors, warnings, slow = self._tree.processors, self._choices.lines, self._slow.lines
+        processors, warnings, slow = self._tree.processors, self._unknown_words(), self._slow.lines
         failures = {failure.name: f"{failure}; {NEXT_STEP}" for failure in self._tree.failures}
         for level, lines, more in (
-            (DiagnosticStatus.ERROR, [*failures.values()], "failed processors"),
-            (DiagnosticStatus.WARN, [*slow.values()], "slow processors"),
-            (DiagnosticStatus.WARN, warnings, "unknown words"),
-            (DiagnosticStatus.OK, [f"{len(processors)} processors"], ""),
+            (ERROR, [*failures.values()], "failed processors"),
+            (WARN, [*slow.values()], "slow processors"),
+            (WARN, warnings, "unknown words"),
+            (OK, [f"{len(processors)} processors"], ""),
         ):
             if lines:
                 rest = f" (and {len(lines) - 1} more {more})" if len(lines) > 1 else ""

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from rosafe.audio.files.windows import rows_of, split_new_frames, window_error
+from rosafe.audio.stream.frame_clock import FrameTime, LinearClock
 from rosafe.declarations.block_length import DEFAULT_FRAMES_PER_BLOCK
-from rosafe.ros1.component.frame_clock import FrameTime, LinearClock
 
 RING_SECONDS = 10.0  # the tree may fall behind by this much before frames are lost
 OVERLAP_CHECK_FRAMES = 1000  # frames of a window that are compared with the previous window

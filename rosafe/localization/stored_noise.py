@@ -6,10 +6,9 @@ import os
 from pathlib import Path
 
 from rosafe.localization import model_cache
-from rosafe.localization.live import OK, WARN
+from rosafe.localization.live import OK, WARN, Status
 from rosafe.localization.localizer import Localizer
 from rosafe.localization.noise import NoiseCalibration
-from rosafe.ros1.localizer.status import NodeStatus
 from rosafe.system.trust import foreign
 
 NO_FILE = "none"  # the value of ~noise without a file
@@ -38,7 +37,7 @@ class StoredNoise:
     ----------
     setting : str
         The file, `NO_FILE`, or empty: the default file if it exists.
-    status : NodeStatus
+    status : Status
         Reports which file is used, and if it cannot be used.
 
     Raises
@@ -47,7 +46,7 @@ class StoredNoise:
         The file that `setting` names is missing or damaged: one line.
     """
 
-    def __init__(self, setting: str, status: NodeStatus) -> None:
+    def __init__(self, setting: str, status: Status) -> None:
         self._status = status
         self._calibration: NoiseCalibration | None = None
         status.value("noise calibration", NO_FILE)
