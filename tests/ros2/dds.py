@@ -27,7 +27,7 @@ from cyclonedds.util import duration
 
 FOLDER = Path(__file__).parents[2] / "ros2" / "rosafe_msgs"
 PACKAGE = "rosafe_msgs"
-LOOPBACK = '<General><Interfaces><NetworkInterface name="lo" multicast="true"/></Interfaces></General>'
+LOOPBACK = '<Discovery><Peers><Peer address="127.0.0.1"/></Peers></Discovery>'
 SCALARS = {
     "bool": bool,
     "float64": float64,
@@ -114,6 +114,6 @@ def call(service: str, kind: str, fields: str) -> None:
 
 
 if __name__ == "__main__":
-    os.environ["CYCLONEDDS_URI"] = f"<CycloneDDS><Domain>{LOOPBACK}</Domain></CycloneDDS>"
+    os.environ["CYCLONEDDS_URI"] = LOOPBACK
     {"listen": listen, "idle": idle, "call": call}[sys.argv[1]](*sys.argv[2:])
     assert "rclpy" not in sys.modules
