@@ -195,11 +195,13 @@ class MessageOrder:
             self._origin = first.start
         length = self._length or first.frames
         tolerance = max(self._slack, self._jitter, min(self.LONGEST_TOLERANCE, length / 2 / self._rate))
-        # s by which each message is late if those before it continue the sound
-        ends = itertools.accumulate((message.frames for message in self._held), initial=0)
-        late = [m.start - self.newest - end / self._rate for m, end in zip(self._held, ends, strict=False)]
-        if first.skipped and abs(late[0] - first.skipped * length / self._rate) <= tolerance:
-            return first.skipped * length
+        # s by which each message is late if those before it, and those skipped since the first, continue the sound
+        missing = [(message.skipped or 0) * length for message in self._held]
+        lengths = (message.frames + skipped for message, skipped in zip(self._held, missing[1:], strict=False))
+        begins = itertools.accumulate(lengths, initial=0)
+        late = [m.start - self.newest - begin / self._rate for m, begin in zip(self._held, begins, strict=True)]
+        if missing[0] and -tolerance <= late[0] - missing[0] / self._rate <= self.LONGEST_TOLERANCE:
+            return missing[0]  # a further delay is that of messages that are complete
         if self._continues(late[0], tolerance):
             self._origin += min(late[0], self.DRIFT * first.frames / self._rate)
             return 0
@@ -433,7 +435,7 @@ class ReceivedSource(ReceivedSound):
     """
 
     # Slack and confirm of MessageOrder, s. Times of arrival depend on the load of two computers.
-    STAMPS = 0.003, 0.1
+    STAMPS = 0.0005, 0.1
     ARRIVALS = 0.25, 1.0
 
     def __init__(
