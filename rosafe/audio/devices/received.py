@@ -34,7 +34,8 @@ MAX_CHANNELS = 64
 MAX_MESSAGE = 2**22  # frames in a message
 MAX_WAITING = 2**24  # received frames that wait to be read, 128 MB; further frames are lost
 PAUSE_SECONDS = 1.0  # without a message, until the source reports a pause
-FIRST_SECONDS = 3.0  # timeout for the first message and the description of the format
+FIRST_SECONDS = 3.0  # timeout for the first message
+DESCRIPTION_SECONDS = 6.0  # the same with a description of the format, which drivers repeat every 5 s
 _UNCODED = ("", "wave", "wav", "raw", "pcm")
 _CODED = {b"ID3": "MP3", b"OggS": "Ogg", b"fLaC": "FLAC", b"RIFF": "a WAV file"}  # by their first bytes
 _SNIFFED = 8  # messages in which coded sound is detected
@@ -159,7 +160,8 @@ class MessageOrder:
         """Yield the messages that are complete up to here, each with the number of frames lost before it."""
         self._held.append(message)
         self._measure(message)
-        while self._held and (gap := self._gap(final=len(self._held) > self.MAX_HELD)) is not None:
+        full = len(self._held) > self.MAX_HELD or sum(held.frames for held in self._held) > MAX_MESSAGE
+        while self._held and (gap := self._gap(final=full)) is not None:
             yield self._place(gap)
 
     def flush(self) -> Iterator[tuple[int, Received]]:
@@ -577,7 +579,7 @@ class ReceivedSource(ReceivedSound):
         except ValueError as problem:
             self.end(f"{problem}; call Acquire")
         for text in self._order.remarks:
-            self._remark(text[:20], text)
+            self._remark(text, text)
         self._order.remarks.clear()
 
     def flush(self) -> None:
@@ -626,7 +628,7 @@ class ReceivedSource(ReceivedSound):
             return ""
         self._sniffed.append(begin)
         kind = next((kind for magic, kind in _CODED.items() if begin.startswith(magic)), "")
-        # frames of MPEG, layer III; samples of two messages hardly begin with the same bytes of this kind
+        # Frames of MPEG, layer III. Three of eight messages with samples hardly begin like that.
         mpeg = [one for one in self._sniffed if one[:1] == b"\xff" and len(one) > 1 and one[1] & 0xE6 == 0xE2]
         return self._coded(kind or "MP3") if kind or len(mpeg) > 2 else ""
 
