@@ -49,7 +49,8 @@ class SoundSource(Protocol):
     def read(self) -> Chunk | None:
         """Wait for the next chunk; None at the end of the source or after a stop.
 
-        Raises ComponentError if the source fails permanently.
+        The chunk is empty if no sound arrives for the moment, and there is a remark about it. Raises
+        ComponentError if the source fails permanently.
         """
 
     def close(self) -> None:

@@ -133,13 +133,16 @@ class Capture:
                 self._report(loss_text(lost, self.last_frame_index, self.source.sample_rate))
             for text in take_remarks(self.source):
                 self._report(text)
+            new = chunk.gap + chunk.samples.shape[1]
+            if not new:  # a pause of the source has begun
+                continue
             self._window.skip(chunk.gap)
             self._window.append(chunk.samples)
-            new = chunk.gap + chunk.samples.shape[1]
             self.last_frame_index += new
             self._unpublished += new
             self._time_ns = wall_time_ns(chunk.time)
-            if not self._may_defer_publish(begin - chunk.time):
+            # stamps of other drivers may be from another clock
+            if not self._may_defer_publish(getattr(self.source, "behind", begin - chunk.time)):
                 self.publish()
             cycle(time.monotonic() - begin)
         if self._unpublished:

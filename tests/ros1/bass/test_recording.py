@@ -180,12 +180,16 @@ def test_bag_contains_each_frame_with_its_index_and_time(tmp_path: Path, no_paus
     assert all(message.stamp.sec * 10**9 + message.stamp.nsec == time for message, time in messages)
 
 
-def test_bag_of_less_than_a_window(tmp_path: Path, no_pauses: None) -> None:
-    samples = bags.stream(25)
+@pytest.mark.parametrize(("frames", "piece"), [(25, 25), (100, 7)])
+def test_bag_of_less_than_a_window_and_of_pieces_that_do_not_divide_it(
+    tmp_path: Path, no_pauses: None, frames: int, piece: int
+) -> None:
+    samples = bags.stream(frames)
     file = BagWriter(empty(tmp_path / "a.bag"), RATE, 10, "/bass/Audio", newest=5)
-    file.write(samples, 10**9)
+    for begin in range(0, frames, piece):
+        file.write(samples[:, begin : begin + piece], 10**9)
     file.close()
-    assert np.array_equal(play(tmp_path / "a.bag")[0][:, :25], samples)
+    assert np.array_equal(play(tmp_path / "a.bag")[0][:, :frames], samples)
 
 
 def test_bag_stops_while_there_is_space_for_its_index(

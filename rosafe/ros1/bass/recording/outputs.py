@@ -126,6 +126,8 @@ class BagWriter:
         count = samples.shape[1]
         for begin in range(0, count, self._chunk):
             piece = samples[:, begin : begin + self._chunk]
+            if self._held + piece.shape[1] > self._window.frames:
+                self._write_incomplete_window()  # its first frames leave the window now
             self._window.append(piece)
             self._count(piece.shape[1])
             behind = count - begin - piece.shape[1]

@@ -66,6 +66,8 @@ class SoundRecorder:
             if chunk is None:
                 return not stopping.is_set()
             self._note_losses()
+            if not chunk.gap + chunk.samples.shape[1]:  # a pause of the source has begun
+                continue
             gap = min(chunk.gap, self._room())
             if gap and self._output is not None:
                 self._output.lose(gap)
