@@ -20,6 +20,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -381,7 +382,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM, and return its exit code: 1 if it cannot start."""
     stop = threading.Event()
     with _signals(stop):
-        rclpy.init(args=quoted(sys.argv if argv is None else argv), signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            rclpy.init(args=quoted(sys.argv if argv is None else argv), signal_handler_options=SignalHandlerOptions.NO)
+        except (RCLError, ValueError) as problem:  # such as an argument that cannot be read
+            print(f"rosafe: {printable(str(problem))}", file=sys.stderr)
+            return 1
         node = None
         executor = MultiThreadedExecutor(THREADS)
         thread = threading.Thread(target=_spin, args=(executor, stop), name="ROS", daemon=True)

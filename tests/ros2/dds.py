@@ -107,9 +107,11 @@ def call(service: str, kind: str, fields: str) -> None:
     writer = DataWriter(participant, Topic(participant, f"rq{service}Request", asking), qos=RELIABLE)
     reader = DataReader(participant, Topic(participant, f"rr{service}Reply", answering), qos=RELIABLE)
     until(lambda: writer.get_matched_subscriptions() and reader.get_matched_publications())
-    writer.write(asking(**json.loads(fields)))
     found: list[Any] = []
-    until(lambda: found.extend(reader.take(1)) or found)
+    while not found:  # the server may not know the reader yet, and then its answer is lost
+        writer.write(asking(**json.loads(fields)))
+        end = time.monotonic() + 2
+        until(lambda: found.extend(reader.take(1)) or found or time.monotonic() > end)
     print(json.dumps(dataclasses.asdict(found[0])), flush=True)
 
 
