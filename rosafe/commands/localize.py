@@ -255,7 +255,8 @@ def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
     become_node("rosafe_localize")
     import rospy
 
-    from rosafe.ros1.localizer import ear_check, measurement, noise
+    from rosafe.localization import stored_noise as noise
+    from rosafe.ros1.localizer import ear_check, measurement
     from rosafe.ros1.localizer.measurement import FrameListener, NoFramesError
     from rosafe.ros1.localizer.settings import read_settings
 

@@ -1,9 +1,9 @@
 """Record sound to a WAV file or a rosbag with a level meter; without an output, show the meter only.
 
-The sound comes from a running bass (topic bass/Audio) or, without ROS, from a --device: a sound card, file:PATH,
-bag:PATH or scene:, named as for Acquire of bass. OUT.wav contains the exact samples with 32 bits; above 4 GiB it is an
-RF64 file, which libsndfile reads like any WAV. OUT.bag is for `rosbag play` and the device bag:. Lost frames are
-replaced by silence and reported. Ctrl-C ends the recording with a complete file."""
+The sound comes from a running bass (topic bass/Audio), another --topic, or a --device: a sound card, file:PATH,
+bag:PATH, topic:/NAME or scene:, named as for Acquire of bass. Only topics need ROS. OUT.wav contains the exact samples
+with 32 bits; above 4 GiB it is an RF64 file, which libsndfile reads like any WAV. OUT.bag is for `rosbag play` and the
+device bag:. Lost frames are replaced by silence and reported. Ctrl-C ends the recording with a complete file."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("output", nargs="?", metavar="OUT", help="file to write, ending in .wav or .bag")
     source = parser.add_mutually_exclusive_group()
-    source.add_argument("--device", metavar="NAME", help="record from this device without ROS; see --list")
-    source.add_argument("--topic", metavar="NAME", help=f"topic of the sound (default: {_TOPIC})")
+    source.add_argument("--device", metavar="NAME", help="record from this device; see --list")
+    source.add_argument("--topic", metavar="NAME", help=f"the same as --device topic:NAME (default: {_TOPIC})")
     parser.add_argument(
         "--calibrate",
         type=option_types.number(0, 200, "a level in dB SPL, such as 94,"),
@@ -89,6 +89,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  rosafe record --device plughw:1,0              # check the levels of a sound card\n"
         "  rosafe record speech.wav --device plughw:1,0   # until Ctrl-C\n"
         "  rosafe record speech.bag --seconds 60          # the sound of a running bass\n"
+        "  rosafe record speech.wav --device topic:/audio # the sound of another driver\n"
         "  rosafe record --calibrate 94 --device plughw:1,0"
     )
 

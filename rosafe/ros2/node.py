@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import json
 import math
@@ -19,7 +20,8 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -53,6 +55,7 @@ from rosafe.ros2.node_tree import NodeTree
 from rosafe.ros2.outputs import QUEUE, Outputs, topics_of
 from rosafe.ros2.parameters import ProcessorParameters
 from rosafe.ros2.sound import Sound
+from rosafe.ros2.sound_topic import open_device
 from rosafe.system.input import read_regular
 from rosafe.system.log_throttle import ThrottledLog
 from rosafe.system.terminal import printable
@@ -63,6 +66,7 @@ from rosafe.tree.tree_planner import kind_of
 TOPICS = ("sources", "posterior", "poses", "streams", "scene_truth")
 WORLD = "world"  # the coordinate frame of a scene, if none is set
 DIAGNOSTICS_SECONDS = 1.0
+THREADS = 2  # of ROS: one may wait for a device whose sound another one receives
 END_SECONDS = 1.0  # that the threads of ROS may take at the end
 PARAMETERS: dict[str, tuple[Any, str]] = {
     "device": ("", "Device to capture from, such as plughw:1,0, file:take.wav, scene: or topic:/audio; empty: none"),
@@ -102,7 +106,7 @@ class RosafeNode:
             log.warning(f"plugin {remark}")
         self._truth = self.node.create_publisher(SceneTruth, "~/scene_truth", QoSProfile(depth=QUEUE))
         self._head_transform: transforms.HeadTransform | None = None
-        self.sound = Sound(self.now, log, self._publish_truth)
+        self.sound = Sound(self.now, log, self._publish_truth, functools.partial(open_device, self.node))
         self._changed = self.node.create_guard_condition(self._update)
         outputs = Outputs(self.node, self.sound, self._changed.trigger)
         self.tree = NodeTree(outputs, self.sound, self._values["frames_per_block"], TOPICS, log)
@@ -160,7 +164,7 @@ class RosafeNode:
             setup = self._keep.saved()
         for representation in values["representations"]:
             kind_of(representation)
-            self._pending.append(lambda name=representation: self.tree.request(name, {}))
+            self._pending.append(functools.partial(self.tree.request, representation, {}))
         if setup.processors:
             self._pending.insert(0, lambda: self.tree.load(setup))
         explicit = "localize" in self._given
@@ -355,7 +359,7 @@ def _signals(stop: threading.Event) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _spin(executor: SingleThreadedExecutor, stop: threading.Event) -> None:
+def _spin(executor: MultiThreadedExecutor, stop: threading.Event) -> None:
     """Handle the events of ROS until `stop`; after an unexpected error too."""
     while not stop.is_set():
         try:
@@ -378,9 +382,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM, and return its exit code: 1 if it cannot start."""
     stop = threading.Event()
     with _signals(stop):
-        rclpy.init(args=quoted(sys.argv if argv is None else argv), signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            rclpy.init(args=quoted(sys.argv if argv is None else argv), signal_handler_options=SignalHandlerOptions.NO)
+        except (RCLError, ValueError) as problem:  # such as an argument that cannot be read
+            print(f"rosafe: {printable(str(problem))}", file=sys.stderr)
+            return 1
         node = None
-        executor = SingleThreadedExecutor()
+        executor = MultiThreadedExecutor(THREADS)
         thread = threading.Thread(target=_spin, args=(executor, stop), name="ROS", daemon=True)
         try:
             node = RosafeNode()

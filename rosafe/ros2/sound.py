@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from rosafe.audio.devices import SoundSource, open_source
+from rosafe.audio.devices import SoundSource
 from rosafe.audio.devices.alsa import DeviceBusyError
 from rosafe.audio.stream.capture import Capture, Snapshot
 from rosafe.audio.stream.frame_clock import LinearClock
@@ -113,7 +113,7 @@ class Sound:
         now: Callable[[], float],
         log: Any,
         publish_truth: Callable[[int, float, Any], object],
-        open_device: OpenSource = open_source,
+        open_device: OpenSource,
     ) -> None:
         self._now, self._log = now, log
         self._report = ThrottledLog(log.warning)

@@ -35,7 +35,7 @@ class ThrottledLog:
         Duration in s.
     """
 
-    def __init__(self, write: Callable[[str], None], period: float = PERIOD) -> None:
+    def __init__(self, write: Callable[[str], object], period: float = PERIOD) -> None:
         self._write = write
         self._period = period
         self._suppressed: dict[str, _SuppressedEvent] = {}

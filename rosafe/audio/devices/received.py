@@ -34,7 +34,8 @@ MAX_CHANNELS = 64
 MAX_MESSAGE = 2**22  # frames in a message
 MAX_WAITING = 2**24  # received frames that wait to be read, 128 MB; further frames are lost
 PAUSE_SECONDS = 1.0  # without a message, until the source reports a pause
-FIRST_SECONDS = 3.0  # timeout for the first message and the description of the format
+FIRST_SECONDS = 3.0  # timeout for the first message
+DESCRIPTION_SECONDS = 6.0  # the same with a description of the format, which drivers repeat every 5 s
 _UNCODED = ("", "wave", "wav", "raw", "pcm")
 _CODED = {b"ID3": "MP3", b"OggS": "Ogg", b"fLaC": "FLAC", b"RIFF": "a WAV file"}  # by their first bytes
 _SNIFFED = 8  # messages in which coded sound is detected
@@ -106,7 +107,8 @@ class MessageOrder:
 
     The stamp of a message that continues the sound is that of the previous one plus its length. Stamps that are taken
     when a message is published are later than that by a changing delay, but soon return. A message that does not
-    continue the sound is therefore held until those after it show which of the two it is.
+    continue the sound is therefore held until those after it show which of the two it is. The more the delays have
+    changed before, the longer this takes.
 
     Parameters
     ----------
@@ -114,6 +116,8 @@ class MessageOrder:
         Hz.
     slack : float
         s; smaller deviations of times do not count as losses.
+    confirm : float
+        s for which later messages have to show the same loss.
 
     Attributes
     ----------
@@ -121,9 +125,12 @@ class MessageOrder:
         Lines about events that lose no sound; the caller clears them.
     """
 
-    CONFIRM_SECONDS = 0.2  # for which later messages have to show the same loss
-    CONFIRM_MESSAGES = 2
-    MAX_HELD = 256  # messages
+    CONFIRM_MESSAGES = 2  # that have to show the same loss
+    CONFIRM_JITTERS = 20.0  # additional time for that, in units of the jitter
+    UNBROKEN_SECONDS = 1.0  # the same for messages that are complete by their numbers
+    JITTER_SECONDS = 2.0  # time constant with which the jitter is forgotten
+    MAX_JITTER = 0.05  # s
+    MAX_HELD = 1024  # messages
     DRIFT = 1e-3  # s per s, of the sample clock against the clock of the stamps
     LONGEST_TOLERANCE = 0.25  # s
     STEP_SECONDS = 1.0  # a shorter change of the clock counts as lost sound
@@ -131,10 +138,12 @@ class MessageOrder:
     MEASURED_SECONDS = 2.0  # after which the number of frames per second is compared with the sample rate
     RATES = (0.8, 1.25)  # expected quotient
 
-    def __init__(self, sample_rate: int, slack: float) -> None:
+    def __init__(self, sample_rate: int, slack: float, confirm: float) -> None:
         self.remarks: list[str] = []
         self._rate = sample_rate
         self._slack = slack
+        self._confirm = confirm
+        self._jitter = 0.01  # s, by which messages were late; at first it is not known
         self._origin: float | None = None  # time of the first frame, by the earliest stamps
         self._end = 0  # frames so far, including lost ones
         self._length = 0  # frames of the last message
@@ -151,7 +160,8 @@ class MessageOrder:
         """Yield the messages that are complete up to here, each with the number of frames lost before it."""
         self._held.append(message)
         self._measure(message)
-        while self._held and (gap := self._gap(final=len(self._held) > self.MAX_HELD)) is not None:
+        full = len(self._held) > self.MAX_HELD or sum(held.frames for held in self._held) > MAX_MESSAGE
+        while self._held and (gap := self._gap(final=full)) is not None:
             yield self._place(gap)
 
     def flush(self) -> Iterator[tuple[int, Received]]:
@@ -162,6 +172,7 @@ class MessageOrder:
     def _place(self, gap: int) -> tuple[int, Received]:
         message = self._held.pop(0)
         self._end += gap + message.frames
+        self._jitter *= 1 - min(0.5, message.frames / self._rate / self.JITTER_SECONDS)
         self._length, self._arrived = message.frames, message.arrived
         return gap, message
 
@@ -185,17 +196,20 @@ class MessageOrder:
         if self._origin is None:
             self._origin = first.start
         length = self._length or first.frames
-        tolerance = max(self._slack, min(self.LONGEST_TOLERANCE, length / 2 / self._rate))
-        # s by which each message is late if those before it continue the sound
-        ends = itertools.accumulate((message.frames for message in self._held), initial=0)
-        late = [m.start - self.newest - end / self._rate for m, end in zip(self._held, ends, strict=False)]
-        if first.skipped and abs(late[0] - first.skipped * length / self._rate) <= tolerance:
-            return first.skipped * length
+        tolerance = max(self._slack, self._jitter, min(self.LONGEST_TOLERANCE, length / 2 / self._rate))
+        # s by which each message is late if those before it, and those skipped since the first, continue the sound
+        missing = [(message.skipped or 0) * length for message in self._held]
+        lengths = (message.frames + skipped for message, skipped in zip(self._held, missing[1:], strict=False))
+        begins = itertools.accumulate(lengths, initial=0)
+        late = [m.start - self.newest - begin / self._rate for m, begin in zip(self._held, begins, strict=True)]
+        if missing[0] and -tolerance <= late[0] - missing[0] / self._rate <= self.LONGEST_TOLERANCE:
+            return missing[0]  # a further delay is that of messages that are complete
         if self._continues(late[0], tolerance):
             self._origin += min(late[0], self.DRIFT * first.frames / self._rate)
             return 0
-        if abs(late[last]) <= tolerance:
-            return 0  # the times of those before were wrong
+        if abs(late[last]) <= tolerance:  # the times of those before were wrong
+            self._jitter = max(self._jitter, min(self.MAX_JITTER, abs(late[0])))
+            return 0
         if last and first.skipped is None and abs(self._held[last].start - self.newest) <= tolerance:
             self.remarks.append("messages are not used, as another message has their time; stop other publishers")
             del self._held[:-1]
@@ -203,16 +217,22 @@ class MessageOrder:
         return self._lasting(late, length, final)
 
     def _continues(self, late: float, tolerance: float) -> bool:
-        starting = self._end < self.START_SECONDS * self._rate
-        return abs(late) <= tolerance or (starting and -self.LONGEST_TOLERANCE < late < 0)
+        if abs(late) <= tolerance:
+            self._jitter = max(self._jitter, min(self.MAX_JITTER, abs(late)))
+            return True
+        return self._end < self.START_SECONDS * self._rate and -self.LONGEST_TOLERANCE < late < 0
 
     def _lasting(self, late: list[float], length: int, final: bool) -> int | None:
         """Return the number of frames lost before the first message; None if the lateness may not last."""
         least = min(map(abs, late))
         # from this message on, all are late by at least about as much
-        since = next(index for index, value in enumerate(late) if abs(value) <= least + self._slack)
-        seconds = self._held[-1].start - self._held[since].start
-        if final or (seconds >= self.CONFIRM_SECONDS and len(late) - since > self.CONFIRM_MESSAGES):
+        slack = max(self._slack, self._jitter)
+        since = next(index for index, value in enumerate(late) if abs(value) <= least + slack)
+        seconds = self._confirm + self.CONFIRM_JITTERS * self._jitter
+        if self._held[0].skipped == 0:
+            seconds = max(seconds, self.UNBROKEN_SECONDS)
+        shown = self._held[-1].start - self._held[since].start
+        if final or (shown >= seconds and len(late) - since > self.CONFIRM_MESSAGES):
             return self._lost(self._held[0], math.copysign(least, late[since]), length)
         return None
 
@@ -416,8 +436,9 @@ class ReceivedSource(ReceivedSound):
         ``::bass::e_device`` for unknown options, ``::bass::e_hwparams`` for options that do not fit together.
     """
 
-    STAMP_SLACK = 0.003  # s; smaller losses are not seen in stamps
-    ARRIVAL_SLACK = 0.05  # s; the same in times of arrival
+    # Slack and confirm of MessageOrder, s. Times of arrival depend on the load of two computers.
+    STAMPS = 0.0005, 0.1
+    ARRIVALS = 0.25, 1.0
 
     def __init__(
         self,
@@ -546,7 +567,7 @@ class ReceivedSource(ReceivedSound):
 
     def _append(self, message: Received, stamped: bool) -> None:
         if self._order is None:
-            self._order = MessageOrder(self.sample_rate, self.STAMP_SLACK if stamped else self.ARRIVAL_SLACK)
+            self._order = MessageOrder(self.sample_rate, *(self.STAMPS if stamped else self.ARRIVALS))
         self._put_all(self._order.add(message))
 
     def _put_all(self, messages: Iterator[tuple[int, Received]]) -> None:
@@ -558,7 +579,7 @@ class ReceivedSource(ReceivedSound):
         except ValueError as problem:
             self.end(f"{problem}; call Acquire")
         for text in self._order.remarks:
-            self._remark(text[:20], text)
+            self._remark(text, text)
         self._order.remarks.clear()
 
     def flush(self) -> None:
@@ -607,7 +628,7 @@ class ReceivedSource(ReceivedSound):
             return ""
         self._sniffed.append(begin)
         kind = next((kind for magic, kind in _CODED.items() if begin.startswith(magic)), "")
-        # frames of MPEG, layer III; samples of two messages hardly begin with the same bytes of this kind
+        # Frames of MPEG, layer III. Three of eight messages with samples hardly begin like that.
         mpeg = [one for one in self._sniffed if one[:1] == b"\xff" and len(one) > 1 and one[1] & 0xE6 == 0xE2]
         return self._coded(kind or "MP3") if kind or len(mpeg) > 2 else ""
 

@@ -12,7 +12,7 @@ import rosgraph.names
 import rospy
 
 from rosafe.audio.devices.base import Chunk, check_sample_rate, device_error
-from rosafe.audio.devices.received import FIRST_SECONDS, ReceivedSource
+from rosafe.audio.devices.received import DESCRIPTION_SECONDS, FIRST_SECONDS, ReceivedSource
 from rosafe.audio.files.bagsound import MAX_MESSAGE, MD5SUM, TYPE
 from rosafe.audio.files.windows import MAX_WINDOW, WindowStream, mismatch, new_samples, window_error
 from rosafe.interface import BASS, ComponentError
@@ -110,8 +110,11 @@ class TopicSource(ReceivedSource):
                 self._subscribe(beside if beside in published else "/audio_info", self._receive_info)
             )
         try:
-            absent = "" if self.topic in published else "the topic has no publisher"
-            self.begin(absent, NO_PUBLISHER_SECONDS if absent else FIRST_SECONDS)
+            if self.topic not in published:
+                self.begin("the topic has no publisher", NO_PUBLISHER_SECONDS)
+            else:
+                is_described = self.needs_description and published[self.topic] in (DATA, STAMPED)
+                self.begin(seconds=DESCRIPTION_SECONDS if is_described else FIRST_SECONDS)
         except ComponentError:
             self.close()
             raise

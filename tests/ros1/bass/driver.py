@@ -8,6 +8,7 @@ publishes the samples of the file, int32 (frames, channels), in real time when i
 from __future__ import annotations
 
 import argparse
+import threading
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -62,9 +63,13 @@ class Driver:
             message.header.stamp = rospy.Time.from_sec(self._begin + frame / self.rate)
         self._publisher.publish(message)
 
-    def play(self, samples: np.ndarray, length: int, lost: Iterable[int] = (), first: int = 0) -> None:
+    def play(
+        self, samples: np.ndarray, length: int, lost: Iterable[int] = (), end: threading.Event | None = None
+    ) -> None:
         """Publish samples, int32 (frames, channels), in real time, without the messages with the numbers in `lost`."""
-        for number in range(first, len(samples) // length):
+        for number in range(len(samples) // length):
+            if end is not None and end.is_set():
+                break
             frame = number * length
             if number not in lost:
                 self.send(encode(samples[frame : frame + length], self.form), frame)
