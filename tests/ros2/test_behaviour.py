@@ -65,7 +65,7 @@ def test_a_device_alone_is_localized_in_the_world(ros2: Network, tmp_path: Path,
     assert truth["names"] == ["talker"] and abs(source["azimuth"] - truth["azimuths"][0]) < 0.2
     assert source["speech"] == "nan" and source["level"] < 0
     posterior = client.take("posterior")[-1]
-    assert abs(sum(posterior["probability"]) - 1) < 1e-6 and len(posterior["azimuths"]) > 300
+    assert abs(sum(posterior["probability"]) - 1) < 1e-6 and len(posterior["azimuths"]) == 72
     assert wait_for(lambda: client.take("poses")[-1]["poses"])[0]["orientation"]["z"] > 0.5
     statuses = client.take("/diagnostics")[-1]["status"]
     assert {one["name"] for one in statuses} == {f"rosafe: {part}" for part in ("sound", "processors", "localization")}
@@ -88,9 +88,8 @@ def test_sound_of_another_driver(ros2: Network, tmp_path: Path) -> None:
     ros2.node("representations:=[ild]", "frames_per_block:=160")
     client, driver = Client(ros2, tmp_path), Client(ros2, tmp_path)
     client.subscribe("ild")
-    assert client.call("acquire", device="topic:/none?format=S16LE&rate=16000&of=2")["message"] == (
-        "topic:/none?format=S16LE&rate=16000&of=2: the topic has no publisher; start the driver"
-    )
+    message = client.call("acquire", device="topic:/none?format=S16LE&rate=16000&of=2")["message"]
+    assert message.startswith("topic:/none?format=S16LE&rate=16000&of=2: the topic has no publisher; start the driver")
     noise = np.random.default_rng(1).integers(-2000, 2000, 320)
     data = [*np.stack((2 * noise, noise)).T.astype("<i2").tobytes()]
     finished = threading.Event()
