@@ -20,6 +20,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -391,7 +392,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
             _run(stop)
-        except (ComponentError, SetupError, ValueError, OSError, RuntimeError) as problem:  # those of rcl are the last
+        except (ComponentError, SetupError, ValueError, OSError, RCLError) as problem:
             print(f"rosafe: {printable(' '.join(str(problem).split()))}", file=sys.stderr)
             return 1
         finally:

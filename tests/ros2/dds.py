@@ -27,7 +27,7 @@ from cyclonedds.util import duration
 
 FOLDER = Path(__file__).parents[2] / "ros2" / "rosafe_msgs"
 PACKAGE = "rosafe_msgs"
-LOOPBACK = '<General><Interfaces><NetworkInterface name="lo" multicast="true"/></Interfaces></General>'
+LOOPBACK = '<Discovery><Peers><Peer address="127.0.0.1"/></Peers></Discovery>'
 SCALARS = {
     "bool": bool,
     "float64": float64,
@@ -107,13 +107,15 @@ def call(service: str, kind: str, fields: str) -> None:
     writer = DataWriter(participant, Topic(participant, f"rq{service}Request", asking), qos=RELIABLE)
     reader = DataReader(participant, Topic(participant, f"rr{service}Reply", answering), qos=RELIABLE)
     until(lambda: writer.get_matched_subscriptions() and reader.get_matched_publications())
-    writer.write(asking(**json.loads(fields)))
     found: list[Any] = []
-    until(lambda: found.extend(reader.take(1)) or found)
+    while not found:  # the server may not know the reader yet, and then its answer is lost
+        writer.write(asking(**json.loads(fields)))
+        end = time.monotonic() + 2
+        until(lambda: found.extend(reader.take(1)) or found or time.monotonic() > end)
     print(json.dumps(dataclasses.asdict(found[0])), flush=True)
 
 
 if __name__ == "__main__":
-    os.environ["CYCLONEDDS_URI"] = f"<CycloneDDS><Domain>{LOOPBACK}</Domain></CycloneDDS>"
+    os.environ["CYCLONEDDS_URI"] = LOOPBACK
     {"listen": listen, "idle": idle, "call": call}[sys.argv[1]](*sys.argv[2:])
     assert "rclpy" not in sys.modules
