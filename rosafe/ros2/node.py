@@ -112,6 +112,7 @@ class RosafeNode:
         self.tree = NodeTree(outputs, self.sound, self._values["frames_per_block"], TOPICS, log)
         self._parameters = ProcessorParameters(self.node, self.tree.tree, given, self._changed.trigger)
         self._sound_settings: AcquireSettings | None = None
+        self._lock = threading.Lock()  # of the services, which wait until the node has begun
         self._pending: list[Callable[[], object]] = []  # to do with the first sound
         self._localizer: Mapping[str, Any] | None = None  # its settings
         self._localization: Localization | None = None
@@ -153,6 +154,10 @@ class RosafeNode:
 
     def begin(self) -> None:
         """Acquire the device, build what the parameters name, and localize. Raises ComponentError or ValueError."""
+        with self._lock:
+            self._begin()
+
+    def _begin(self) -> None:
         kernels.compiled()  # before the first block, which would be late otherwise
         importlib.import_module("scipy.signal")
         values = self._values
@@ -262,7 +267,8 @@ class RosafeNode:
 
         def answer(request: Any, response: Any) -> Any:
             try:
-                handler(request, response)
+                with self._lock:
+                    handler(request, response)
                 response.success = True
             except (ComponentError, SetupError, ValueError, OSError) as problem:
                 response.message = printable(getattr(problem, "what", "") or str(problem))
@@ -374,42 +380,41 @@ def _spin(executor: MultiThreadedExecutor, stop: threading.Event) -> None:
 def quoted(arguments: Sequence[str]) -> list[str]:
     """Return arguments of ROS in which the values of texts are quoted: rcl reads `scene:` as an incomplete mapping."""
     texts = "|".join(name for name, (default, _) in PARAMETERS.items() if isinstance(default, str))
-    rule = re.compile(rf"((?:[^:]*:)?(?:{texts}):=)([^'\"].*)")
+    rule = re.compile(rf"((?:[^:=]*:)?(?:(?:{texts}):=(?=[^'\"])|[^:=]*:=(?=[^'\"].*:$)))(.*)")
     return [f"{found[1]}{json.dumps(found[2])}" if (found := rule.fullmatch(one)) else one for one in arguments]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM, and return its exit code: 1 if it cannot start."""
     stop = threading.Event()
+    arguments = quoted(sys.argv if argv is None else argv)
     with _signals(stop):
         try:
-            rclpy.init(args=quoted(sys.argv if argv is None else argv), signal_handler_options=SignalHandlerOptions.NO)
-        except (RCLError, ValueError) as problem:  # such as an argument that cannot be read
-            print(f"rosafe: {printable(str(problem))}", file=sys.stderr)
-            return 1
-        node = None
-        executor = MultiThreadedExecutor(THREADS)
-        thread = threading.Thread(target=_spin, args=(executor, stop), name="ROS", daemon=True)
-        try:
-            node = RosafeNode()
-            executor.add_node(node.node)
-            thread.start()
-            node.begin()
-            stop.wait()
-        except (ComponentError, SetupError, ValueError, OSError) as problem:
-            print(f"rosafe: {printable(str(problem))}", file=sys.stderr)
+            rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+            _run(stop)
+        except (ComponentError, SetupError, ValueError, OSError, RCLError) as problem:
+            print(f"rosafe: {printable(' '.join(str(problem).split()))}", file=sys.stderr)
             return 1
         finally:
-            stop.set()
-            if node is not None:
-                node.close()
-            executor.shutdown(END_SECONDS)
-            if thread.ident:
-                thread.join(END_SECONDS)
-            if node is not None:
-                node.node.destroy_node()
             rclpy.try_shutdown()
     return 0
+
+
+def _run(stop: threading.Event) -> None:
+    node = RosafeNode()
+    executor = MultiThreadedExecutor(THREADS)
+    executor.add_node(node.node)
+    thread = threading.Thread(target=_spin, args=(executor, stop), name="ROS", daemon=True)
+    thread.start()
+    try:
+        node.begin()
+        stop.wait()
+    finally:
+        stop.set()
+        node.close()
+        executor.shutdown(END_SECONDS)
+        thread.join(END_SECONDS)
+        node.node.destroy_node()
 
 
 if __name__ == "__main__":
