@@ -107,9 +107,7 @@ class LocalizerNode:
             self._loop.connect(None)
             self._streams.connect(None)
         else:
-            open_sound = functools.partial(
-                InputSound, ports.audio, ports.format.sample_rate, self._clock, self._status
-            )
+            open_sound = functools.partial(InputSound, ports.audio, ports.format.sample_rate, self._clock, self._status)
             self._streams.connect(ports.model, open_sound)
             self._loop.connect(ports.model, functools.partial(PortSource, ports.topics, ports.format, self._clock))
 

@@ -150,7 +150,9 @@ def source_markers(header: Any, present: Sequence[tuple[int, float, bool]]) -> l
     markers = [Marker(header=header, action=Marker.DELETEALL)]
     for id_, azimuth, speaks in present:
         x, y = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
-        marker = Marker(header=header, ns="sources", id=id_ % 2**31, type=Marker.SPHERE if speaks else Marker.LINE_STRIP)
+        marker = Marker(
+            header=header, ns="sources", id=id_ % 2**31, type=Marker.SPHERE if speaks else Marker.LINE_STRIP
+        )
         marker.pose.orientation = Quaternion(w=1.0)
         marker.color = ColorRGBA(0.1, 0.6, 1.0, 1.0)
         if speaks:

@@ -31,7 +31,9 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
     paths = sorted(RECORDINGS.glob("*_*.wav"))
     if not paths:
         pytest.skip("Debian's alsa-utils is not installed")
-    speech = np.concatenate([scipy.signal.resample_poly(sound, RATE, rate) for sound, rate in map(soundfile.read, paths)])
+    speech = np.concatenate(
+        [scipy.signal.resample_poly(sound, RATE, rate) for sound, rate in map(soundfile.read, paths)]
+    )
     speech = np.resize(speech, round(SECONDS * RATE))
     tune = music(SECONDS, 4)
     head = Head.sphere()
