@@ -6,10 +6,9 @@ OUT.tracks.csv, OUT.json, or OUT.png, a picture of the posterior and the sources
 
 Without SOUND it is the ROS node localizer: it requests the representations that it needs from a running rosAFE, and
 publishes the tracked sources on localizer/sources, localizer/poses and localizer/markers (for rviz) and
-localizer/posterior at 10 Hz, and the sound of each source on localizer/streams, until Ctrl-C. The options of the node are also private ROS parameters: ~head, ~mirror, ~seconds, ~world_frame,
-~head_frame, ~rosafe, ~connect, ~audio_delay, ~noise,
-~speech_only. With --check or --calibrate-noise it measures and ends.
-docs/directions.md describes it."""
+localizer/posterior at 10 Hz, and the sound of each source on localizer/streams, until Ctrl-C. The options of the node
+are also private ROS parameters: ~head, ~mirror, ~seconds, ~world_frame, ~head_frame, ~rosafe, ~connect, ~audio_delay,
+~noise, ~speech_only. With --check or --calibrate-noise it measures and ends. docs/directions.md describes it."""
 
 from __future__ import annotations
 
@@ -40,8 +39,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "                       [-o OUT.csv|.json|.png] [--streams FOLDER] [--channels L,R]\n"
         "                       [--set NAME=VALUE ...] [--force]\n"
         "       rosafe localize [--head FILE] [--[no-]mirror] [--seconds S] [--world-frame NAME] [--head-frame NAME]\n"
-        "                       [--rosafe NAME] [--connect TOPIC] [--speech-only] [--set NAME=VALUE ...] [--name NAME]\n"
-        "                       [-b] [--wait] [NAME:=VALUE ...]"
+        "                       [--rosafe NAME] [--connect TOPIC] [--speech-only] [--set NAME=VALUE ...]\n"
+        "                       [--name NAME] [-b] [--wait] [NAME:=VALUE ...]"
     )
     parser.add_argument("inputs", nargs="*", metavar="SOUND", help="sound file or rosbag with two ears")
     parser.add_argument(

