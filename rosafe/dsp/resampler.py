@@ -1,4 +1,4 @@
-"""Sound that arrives block by block at another sample rate: a polyphase filter, whose output depends on no block length.
+"""Sound that arrives block by block, at another sample rate: a polyphase filter with the same output for all blocks.
 
 The kernel is a sinc with a Kaiser window (J. O. Smith, "Digital Audio Resampling", ccrma.stanford.edu/~jos/resample).
 """
@@ -36,7 +36,7 @@ class Resampler(OwnState):
     def __init__(self, from_rate: float, to_rate: int, unit: int) -> None:
         self._step = Fraction(from_rate).limit_denominator(1000) / to_rate  # input samples for an output sample
         self._unit = unit
-        self._half = 0 if self._step == 1 else math.ceil(_HALF * max(1, self._step))
+        self._half = 0 if self._step == 1 else math.ceil(_HALF * max(1.0, float(self._step)))
         self.reset()
 
     def reset(self) -> None:
@@ -48,7 +48,7 @@ class Resampler(OwnState):
     def process(self, block: FloatArray) -> list[FloatArray]:
         """Return the units (2, `unit`) that are complete with the next block (2, n); it is aligned with the input."""
         self._kept = np.concatenate((self._kept, block), axis=1)
-        units = []
+        units: list[FloatArray] = []
         while True:
             position = self._count * self._step
             begin = math.floor(position)

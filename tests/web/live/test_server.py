@@ -220,9 +220,9 @@ def test_unsuitable_messages_of_a_localizer_are_ignored() -> None:
     found = posterior(np.radians([0.0, 90.0, 180.0, -90.0]), [0.0, 1.0, 0.0, 0.0])
     assert found.sum() == pytest.approx(1) and directions.GRID[found.argmax()] == 90
     assert found[directions.GRID < 0].sum() == 0
-    many = [SimpleNamespace(id=n, azimuth=0.0, azimuth_std=0.1, probability=n / 100) for n in range(100)]
-    slots = directions.source_slots(SimpleNamespace(sources=many)).reshape(-1, 4)
-    assert slots[:, 0].tolist() == list(range(99, 91, -1))
+    many = [SimpleNamespace(id=n, azimuth=0.0, azimuth_std=0.1, probability=n / 100, speech=0.7) for n in range(100)]
+    slots = directions.source_slots(SimpleNamespace(sources=many)).reshape(-1, directions.SOURCE_NUMBERS)
+    assert slots[:, 0].tolist() == list(range(99, 91, -1)) and set(slots[:, 4]) == {0.7}
 
 
 @pytest.fixture
