@@ -142,7 +142,8 @@ class MessageOrder:
         self._rate = sample_rate
         self._slack = slack
         self._confirm = confirm
-        self._jitter = 0.01  # s, by which messages were late; at first it is not known
+        self._jitter = 0.01  # s, by which the lateness of messages has changed; at first it is not known
+        self._late = 0.0  # s, of the last message that was not held
         self._origin: float | None = None  # time of the first frame, by the earliest stamps
         self._end = 0  # frames so far, including lost ones
         self._length = 0  # frames of the last message
@@ -216,7 +217,8 @@ class MessageOrder:
 
     def _continues(self, late: float, tolerance: float) -> bool:
         if abs(late) <= tolerance:
-            self._jitter = max(self._jitter, min(self.MAX_JITTER, abs(late)))
+            self._jitter = max(self._jitter, min(self.MAX_JITTER, abs(late - self._late)))
+            self._late = late
             return True
         return self._end < self.START_SECONDS * self._rate and -self.LONGEST_TOLERANCE < late < 0
 
