@@ -26,8 +26,7 @@ from rosafe.system.terminal import printable
 if TYPE_CHECKING:
     from rosafe.audio.devices import SoundSource
     from rosafe.audio.files.levels import LevelMeter
-    from rosafe.ros1.bass.recording.outputs import Output
-    from rosafe.ros1.bass.recording.recorder import SoundRecorder
+    from rosafe.ros1.bass.recording import Output, SoundRecorder
 
 _TOPIC = "bass/Audio"
 _EARS = ("left", "right")
@@ -191,7 +190,7 @@ def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Soun
 
 def _record(path: Path | None, options: argparse.Namespace, stopping: threading.Event) -> int:
     from rosafe.commands._meter import Meter
-    from rosafe.ros1.bass.recording.recorder import SoundRecorder
+    from rosafe.ros1.bass.recording import SoundRecorder
 
     with ExitStack() as stack:
         # The file is created before the source is opened, so that a second recorder of the same file fails at once.
@@ -299,7 +298,7 @@ def _opened(part: AtomicOutput | None, options: argparse.Namespace, source: Soun
 
 
 def _open_output(part: AtomicOutput, options: argparse.Namespace, source: SoundSource) -> Output:
-    from rosafe.ros1.bass.recording.outputs import BagWriter, WavFile
+    from rosafe.ros1.bass.recording import BagWriter, WavFile
 
     descriptor = part.begin()
     if part.target.suffix.lower() == ".wav":

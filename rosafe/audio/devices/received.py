@@ -36,6 +36,7 @@ MAX_WAITING = 2**24  # received frames that wait to be read, 128 MB; further fra
 PAUSE_SECONDS = 1.0  # without a message, until the source reports a pause
 FIRST_SECONDS = 3.0  # timeout for the first message
 DESCRIPTION_SECONDS = 6.0  # the same with a description of the format, which drivers repeat every 5 s
+_CLOCK = time.time() - time.monotonic()  # of times of arrival, which no change of the clock may alter
 _UNCODED = ("", "wave", "wav", "raw", "pcm")
 _CODED = {b"ID3": "MP3", b"OggS": "Ogg", b"fLaC": "FLAC", b"RIFF": "a WAV file"}  # by their first bytes
 _SNIFFED = 8  # messages in which coded sound is detected
@@ -98,7 +99,6 @@ class Received(NamedTuple):
     frames: int
     samples: np.ndarray | None  # int32, (2, frames); None if its sound is lost
     start: float  # s: clock time of its first frame
-    arrived: float  # s, of time.monotonic
     skipped: int | None  # messages that are missing before it according to their numbers; None if not numbered
 
 
@@ -131,9 +131,8 @@ class MessageOrder:
     JITTER_SECONDS = 2.0  # time constant with which the jitter is forgotten
     MAX_JITTER = 0.05  # s
     MAX_HELD = 1024  # messages
-    DRIFT = 1e-3  # s per s, of the sample clock against the clock of the stamps
+    DRIFT = 5e-4  # s per s, of the sample clock against the clock of the stamps
     LONGEST_TOLERANCE = 0.25  # s
-    STEP_SECONDS = 1.0  # a shorter change of the clock counts as lost sound
     START_SECONDS = 1.0  # in which the first stamp may turn out to be late
     MEASURED_SECONDS = 2.0  # after which the number of frames per second is compared with the sample rate
     RATES = (0.8, 1.25)  # expected quotient
@@ -143,11 +142,11 @@ class MessageOrder:
         self._rate = sample_rate
         self._slack = slack
         self._confirm = confirm
-        self._jitter = 0.01  # s, by which messages were late; at first it is not known
+        self._jitter = 0.01  # s, by which the lateness of messages has changed; at first it is not known
+        self._late = 0.0  # s, of the last message that was not held
         self._origin: float | None = None  # time of the first frame, by the earliest stamps
         self._end = 0  # frames so far, including lost ones
         self._length = 0  # frames of the last message
-        self._arrived = 0.0  # when it arrived
         self._held: list[Received] = []
         self._measured: tuple[float, int] | None = None  # time of the first message, and frames since then
 
@@ -173,7 +172,7 @@ class MessageOrder:
         message = self._held.pop(0)
         self._end += gap + message.frames
         self._jitter *= 1 - min(0.5, message.frames / self._rate / self.JITTER_SECONDS)
-        self._length, self._arrived = message.frames, message.arrived
+        self._length = message.frames
         return gap, message
 
     def _measure(self, message: Received) -> None:
@@ -218,7 +217,8 @@ class MessageOrder:
 
     def _continues(self, late: float, tolerance: float) -> bool:
         if abs(late) <= tolerance:
-            self._jitter = max(self._jitter, min(self.MAX_JITTER, abs(late)))
+            self._jitter = max(self._jitter, min(self.MAX_JITTER, abs(late - self._late)))
+            self._late = late
             return True
         return self._end < self.START_SECONDS * self._rate and -self.LONGEST_TOLERANCE < late < 0
 
@@ -237,19 +237,21 @@ class MessageOrder:
         return None
 
     def _lost(self, first: Received, late: float, length: int) -> int:
-        """Return the number of frames for a lasting change (s) of the lateness, or follow the clock of the stamps."""
+        """Return the number of frames for a lasting change (s) of the lateness, or follow a clock that was set back."""
         assert self._origin is not None
-        is_step = late > self.STEP_SECONDS and first.arrived - self._arrived < late / 4
-        if late < 0 or is_step:
+        if late < 0:
             self._origin += late
-            if abs(late) > self.LONGEST_TOLERANCE:
-                self.remarks.append(f"the clock of the stamps was set by {late:+.3f} s; the sound continues")
+            if late < -self.LONGEST_TOLERANCE:
+                self.remarks.append(f"the clock of the stamps was set back by {-late:.3f} s; the sound continues")
             return 0
         if late > MAX_JUMP_SECONDS:
             raise ValueError(f"a new stream begins (its stamps jump by {late:.0f} s)")
-        frames, messages = round(late * self._rate), round(late * self._rate / length)
-        whole = messages * length
-        return whole if messages and first.skipped != 0 and abs(frames - whole) <= length / 4 else frames
+        frames, whole = round(late * self._rate), round(late * self._rate / length) * length
+        # Drivers may lose any number of frames; without numbers, mostly whole messages are lost.
+        difference = length / 4
+        if first.skipped == 0:
+            difference = min(difference, (self._slack + self._jitter) * self._rate)
+        return whole if whole and abs(frames - whole) <= difference else frames
 
 
 # --- the source -------------------------------------------------------------------------------------------------------
@@ -539,7 +541,7 @@ class ReceivedSource(ReceivedSound):
         publisher : str
             Name of the node that has sent it, if it is known.
         """
-        now, clock = time.monotonic(), time.time()
+        now = time.monotonic()
         with self.arrived:
             if self._end or self._format is None or not len(data) or not self._is_ours(publisher, now):
                 return
@@ -549,8 +551,8 @@ class ReceivedSource(ReceivedSound):
                 return
             frames = min(len(data) // self._format.frame_bytes, MAX_MESSAGE)
             samples = None if self._size_problem(len(data)) else self._decoded(data)
-            start = stamp_ns * 1e-9 if stamp_ns else clock - frames / self._format.rate
-            self._append(Received(frames, samples, start, now, self._skipped(number)), bool(stamp_ns))
+            start = stamp_ns * 1e-9 if stamp_ns else _CLOCK + now - frames / self._format.rate
+            self._append(Received(frames, samples, start, self._skipped(number)), bool(stamp_ns))
             self._note_message(now, number)
 
     def _unusable(self, data: Any) -> ComponentError | None:

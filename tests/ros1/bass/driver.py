@@ -42,6 +42,7 @@ class Driver:
         self._publisher = rospy.Publisher(topic, kind, queue_size=1000, tcp_nodelay=True)
         self._info = rospy.Publisher(info, CLASSES["AudioInfo"], latch=True, queue_size=1) if info else None
         self._begin = 0.0
+        self.newest = 0.0  # clock time of the end of the last message
 
     def describe(self, channels: int, coding: str = "wave", form: str = "") -> None:
         """Publish the format."""
@@ -73,7 +74,8 @@ class Driver:
             frame = number * length
             if number not in lost:
                 self.send(encode(samples[frame : frame + length], self.form), frame)
-            time.sleep(max(0.0, self._begin + (frame + length) / self.rate - time.time()))
+            self.newest = self._begin + (frame + length) / self.rate
+            time.sleep(max(0.0, self.newest - time.time()))
 
     def close(self) -> None:
         """Unregister."""

@@ -160,17 +160,6 @@ def test_malformed_requests(text: bytes, request_: tuple[int, int]) -> None:
     assert list(take_requests(bytearray(text), quiet=False)) == [request_]
 
 
-@settings(max_examples=60)
-@given(st.binary(max_size=300), st.integers(-(2**70), 2**70), st.integers(-(2**70), 2**70))
-def test_no_request_gets_a_negative_count(rubbish: bytes, count: int, first: int) -> None:
-    inbox = bytearray(rubbish + b"Read Port - N %d - nfr %d\n" % (count, first))
-    found = list(take_requests(inbox, quiet=True))
-    assert found[-1] == (max(0, count), max(0, first))
-    for request_ in found:
-        n, loss, following, *_ = parse(read_frames(port_content(100, 20), *request_))
-        assert n >= 0 and loss >= 0 and following >= 0
-
-
 @pytest.mark.parametrize(
     "text", [b"Read Port\n", b"Read Port - N 5\n", b"Read Port - nfr 5\n", b"N 1 - nfr 1\n", b"Close\n", b"\n\0\r", b""]
 )
@@ -360,8 +349,3 @@ def test_end_closes_connections_and_releases_the_port(server: Server) -> None:
     server.thread.join(PATIENCE)
     with socket.create_server(server.address):
         pass
-
-
-def test_taken_port_is_an_error(server: Server) -> None:
-    with pytest.raises(OSError, match="in use"):
-        DedicatedSocket(lambda: None, "127.0.0.1", server.address[1], server.reports.append)
