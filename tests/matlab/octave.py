@@ -30,6 +30,11 @@ end
 """
 
 
+def script(name: str) -> str:
+    """Return a script in the folder `scripts`."""
+    return (Path(__file__).with_name("scripts") / f"{name}.m").read_text("utf-8")
+
+
 def require_program(program: str = "octave-cli") -> None:
     """Skip the test if Octave, or a program for its plots, is not installed."""
     if shutil.which(program) is None:
