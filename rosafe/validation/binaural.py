@@ -86,7 +86,6 @@ def coherence(process: Process) -> Measured:
     return Measured.of(expected, expected, measured, "correlation", "IC")
 
 
-LEAD = "largest difference of the median over channels from 300 to 1300 Hz and all frames but the first ten"
 
 
 def lead_and_lag(itd: float, level_db: float) -> FloatArray:
