@@ -283,16 +283,6 @@ def test_empty_folders_and_a_foreign_list_of_failures(tmp_path: Path) -> None:
     assert_results(tmp_path / "out", {f"corpus/{name}": sound for name, sound in sounds.items()})
 
 
-@pytest.mark.skipif(os.getuid() == 0, reason="root may read everything")
-def test_unreadable_files(tmp_path: Path) -> None:
-    sounds = corpus(tmp_path / "corpus", 3)
-    (tmp_path / "corpus" / "sub dir").chmod(0)
-    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path)
-    (tmp_path / "corpus" / "sub dir").chmod(0o700)
-    assert done.returncode == 1 and "Permission denied" in failed(tmp_path / "out")["corpus/sub dir"]
-    assert_results(tmp_path / "out", {"s0": sounds["s0"]})
-
-
 def test_existing_results_are_kept_unless_resume_is_given(tmp_path: Path) -> None:
     sounds = corpus(tmp_path / "corpus", 2)
     assert rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path).returncode == 0

@@ -13,12 +13,13 @@ import pytest
 
 from rosafe.interface import BASS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
-from rosafe.ros1.client import whole_trees
+from rosafe.ros1.client import whole_trees as module_of_whole_trees
 from rosafe.tree.setups import Setup, dry_run, plan, read, setup_processor, write
 from rosafe.tree.tree import Tree
 from tests.tree.support import Recorder, end
 from tests.tree.test_tree_builder import Client
 
+whole_trees: Any = module_of_whole_trees  # with `Graph` instead of a client
 SETUP = """
 sound: {device: "scene:", nFramesPerChunk: 441}
 connections: {Audio: bass/Audio}

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import tomllib
 
 from tests import harness
 from tests.web.genomix import world as worlds
@@ -50,136 +51,8 @@ def test_the_guide_runs_as_a_script(fresh_world: World) -> None:
 
 
 PATTERNS = {
-    "1: literal handle, plugin path": """
-        genomix::connect $address
-        genomix1 load /home/robot/openrobots/lib/genom/ros/plugins/bass.so
-        after 10
-        show [bass::Stop]
-    """,
-    "2: rpath": """
-        genomix::connect $address
-        genomix1 rpath ~/openrobots/devel/lib/genom/ros/plugins/
-        genomix1 load bass
-        show [bass::Stop]
-    """,
-    "3 4: positional and braced, absolute remote": """
-        ::genomix::connect $address
-        genomix1 load rosAFE
-        ::rosAFE::connect_port {local Audio remote /bass/Audio}
-        show [::rosAFE::connect_port Audio /bass/Audio]
-    """,
-    "5: private server, result unused": """
-        genomix::localhost
-        genomix1 load rosAFE
-        show [rosAFE::connect_port "Audio" "bass/Audio"]
-    """,
-    "6: host and port, instance and alias, spaces in braces": """
-        set g [genomix::connect $address]
-        $g rpath /tmp
-        $g load bass -i bass as bass
-        $g load rosAFE -i rosAFE as rosAFE
-        show [rosAFE::connect_port { local Audio remote bass/Audio }]
-    """,
-    "7: a loop that reads a port": """
-        set handle [genomix::connect $address]
-        $handle load bass -i bass
-        bass::Acquire {device scene:}
-        for {set i 0} {$i < 5} {incr i} {
-            set m [bass::Audio]
-            set rate [dict get [dict get $m Audio] sampleRate]
-        }
-        show [expr {$rate == 44100 ? "" : $rate}]
-    """,
-    "8: callback that takes the result": """
-        set g [genomix::connect $address]
-        $g load bass
-        proc acquired {mod rqid} {
-            catch {$rqid result} m
-            set ::told [list $mod [$rqid status] $m]
-        }
-        bass::Acquire {device none} & acquired bass
-        vwait told
-        show [expr {[lrange $told 0 1] eq {bass error} ? [string range [dict get [lindex $told 2] ex] 17 end] : $told}]
-    """,
-    "9: request name dropped": """
-        set g [genomix::connect $address]
-        $g load bass
-        bass::Acquire scene: &
-        bass::Stop &
-        show [bass::Stop]
-    """,
-    "10: negative positions": """
-        set g [genomix::connect $address]
-        $g load rosAFE
-        catch {rosAFE::PreProc -- p input 0 -100} m
-        show [expr {[dict get $m ex] eq "::rosAFE::e_noUpperDependencie" ? "" : $m}]
-    """,
-    "11 13: computed dicts, saved output as input": """
-        set g [genomix::connect $address]
-        $g load bass
-        bass::Acquire [dict create device scene: sampleRate 22050]
-        set saved [dict filter [dict get [bass::Audio] Audio] key sampleRate nFramesPerChunk]
-        show [bass::Acquire [dict create device scene: {*}$saved]]
-    """,
-    "12: lassign on a structure": """
-        set g [genomix::connect $address]
-        $g load bass
-        bass::Acquire scene:
-        lassign [dict get [bass::Audio] Audio] k1 rate k2 chunks
-        show [expr {"$k1 $rate $k2 $chunks" eq "sampleRate 44100 nChunksOnPort 20" ? "" : "$k1 $rate"}]
-    """,
-    "15: kill one after another": """
-        set g [genomix::connect $address]
-        $g load left
-        show [left::kill]
-    """,
-    "16 19: -s with &, status, result's exception": """
-        set s [catch {set handle [genomix::connect $address]} result]
-        $handle load bass
-        set request [::bass::Acquire -s {device none} &]
-        while {[$request status] eq "sent"} {update; after 5}
-        catch {$request result} e
-        show [expr {[dict get $e ex] eq "::bass::e_device" ? "" : $e}]
-    """,
-    "17: wait for the component, then load": """
-        set handle [genomix::connect $address]
-        while 1 {
-            if {![catch {exec rostopic list | grep -c bass}]} {
-                $handle load bass -i bass
-                break
-            }
-            after 500
-        }
-        show [bass::Stop]
-    """,
-    "18: eval and catch": """
-        set g [genomix::connect $address]
-        $g load rosAFE
-        lassign {rosAFE Audio bass Audio} c1 p1 c2 p2
-        set status [catch {eval "$c1::connect_port $p1 $c2/$p2"} result]
-        set status [catch {eval "${c1}::connect_port $p1 $c2/$p2"} result]
-        show [expr {$status == "0" ? $result : "$status $result"}]
-    """,
-    "20: -h tells whether a service exists": """
-        set g [genomix::connect $address]
-        $g load rosAFE
-        show [expr {[catch {rosAFE::getSignals -h}] || ![catch {rosAFE::nothing -h}] ? "wrong" : ""}]
-    """,
-    "21: -ack with subst": """
-        set g [genomix::connect $address]
-        $g load bass
-        set rate 16000
-        set r [bass::Acquire -ack [subst {device scene: sampleRate $rate}]]
-        show [expr {[dict get [bass::Audio] Audio sampleRate] == $rate ? "" : "not acknowledged"}]
-    """,
-    "24b: continued lines and comments": """
-        set g [genomix::connect $address]
-        $g load bass; $g load rosAFE ;#comment
-        ::bass::Acquire {device scene: sampleRate 44100 \\
-            nFramesPerChunk 2205 nChunksOnPort 20} &
-        show [::bass::Stop]
-        exit
-    """,
+    name: pattern["script"]
+    for name, pattern in tomllib.loads(Path(__file__).with_name("patterns.toml").read_text("utf-8")).items()
 }
 
 

@@ -22,7 +22,7 @@ from rosafe.audio.devices.scene import Scene
 from rosafe.web.live import directions
 from rosafe.web.live.access import TokenAuth
 from rosafe.web.live.server import MAX_CLIENTS
-from rosafe.web.server.refusal import HttpRefusal
+from rosafe.web.server.access import HttpRefusal
 from tests.harness import ROOT, Graph, Process, wait_for
 from tests.web.live.world import Live, build, live, localizer, page
 
