@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import threading
 
+from rosafe.audio.stream.ring import AudioReader
 from rosafe.localization.live import Status
 from rosafe.localization.live_streams import BLOCK_SECONDS, SoundBlock
 from rosafe.ros import FrameClock
 from rosafe.ros1.afe.audio_input import AudioInput
-from rosafe.ros1.component.audio import AudioReader
 
 _BEFORE_SECONDS = 1.0  # of sound that has arrived: the floors of the channels are known when it has been processed
 

@@ -16,6 +16,7 @@ from rosafe.localization import cues
 from rosafe.localization.cues import PARAMETERS
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.live import NewFrames
+from rosafe.localization.settings import LocalizerSettings
 from rosafe.ros1.localizer import ear_check, measurement
 from rosafe.ros1.localizer.ear_check import (
     DIRECTIONS,
@@ -26,7 +27,6 @@ from rosafe.ros1.localizer.ear_check import (
     check_ordinary,
     heard_sound,
 )
-from rosafe.localization.settings import LocalizerSettings
 from rosafe.ros1.transport import registration
 from tests.harness import Graph, Process, wait_for
 from tests.localization.conftest import RATE, modulated
