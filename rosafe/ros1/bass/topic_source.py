@@ -24,7 +24,7 @@ MAX_CHUNK = int(BASS.service("Acquire").parameter("nFramesPerChunk").maximum or 
 _AUDIO = BASS.port("Audio").idl
 _HEADER, _LENGTH, _INFO = struct.Struct("<III"), struct.Struct("<I"), struct.Struct("<BI")
 DATA, STAMPED, INFO = (f"audio_common_msgs/{name}" for name in ("AudioData", "AudioDataStamped", "AudioInfo"))
-MD5SUMS = {  # of the types that can be read
+MD5SUMS = {  # by type, of messages that can be read
     DATA: "f43a8e1b362b75baa741461b46adc7e0",
     STAMPED: "3cdd84a06846af0dca4d0434908f9d96",
     INFO: "9413d9b7029680d3b1db6ed0ae535f88",
@@ -95,7 +95,7 @@ class TopicSource(ReceivedSource):
             raise device_error(f"{self.name}: expected the name of a topic, such as /audio")
         self.topic = rospy.resolve_name(self.topic)
         self.newest = self.port_chunk = 0
-        self._windows: WindowStream | None = None  # of a port Audio
+        self._windows: WindowStream | None = None  # joins the messages of a port Audio
         self._window_class = serialization.tolerant_message_class("bass", _AUDIO, MAX_WINDOW)
         published = master.bounded(_published, None, stopping.is_set, NO_PUBLISHER_SECONDS)
         if published is None:
