@@ -74,9 +74,9 @@ class RectangularRoom:
         if len(self.size) != 3:
             raise ValueError(f"size: expected three sides in m, got {short_repr(self.size)}")
         surface = 2 * sum(self.volume / side for side in self.size)
-        shortest = 0.161 * self.volume / (-np.log(1 - ABSORPTION) * surface)  # Eyring's formula
+        shortest = np.ceil(-16.1 * self.volume / (np.log(1 - ABSORPTION) * surface)) / 100  # Eyring's formula, s
         if self.rt60 < shortest:
-            raise ValueError(f"rt60: expected at least {shortest:.2f} s in a room of this size, got {self.rt60:g}")
+            raise ValueError(f"rt60: expected at least {shortest:g} s in a room of this size, got {self.rt60:g}")
         inside = (MARGIN <= at <= side - MARGIN for at, side in zip(self.head, self.size, strict=True))
         if not all(inside):
             raise ValueError(f"position: expected a place inside the room, got {short_repr(self.position)}")
@@ -92,11 +92,11 @@ class RectangularRoom:
         return tuple(side / 2 for side in self.size) if self.position is None else self.position
 
     def largest_distance(self, azimuths: FloatArray) -> float:
-        """Return how far (m) a source may be from the head at all `azimuths` (degrees, in the world)."""
+        """Return how far (m, full cm) a source may be from the head at all `azimuths` (degrees, in the world)."""
         ways = np.stack((np.cos(np.radians(azimuths)), np.sin(np.radians(azimuths))), axis=1)
         head, size = np.array(self.head[:2]), np.array(self.size[:2])
         free = np.where(ways > 0, size - MARGIN - head, head - MARGIN)
-        return float(np.min(free / np.maximum(np.abs(ways), 1e-9)))
+        return float(np.floor(100 * np.min(free / np.maximum(np.abs(ways), 1e-9)) + 1e-6)) / 100
 
 
 class RoomReflections:

@@ -124,7 +124,7 @@ class SceneDescription:
                 course = np.arange(values.min(), min(values.max(), values.min() + 360) + 1)
                 if source.distance > (largest := self.room.largest_distance(course)):
                     raise ValueError(
-                        f"{source.name}: distance: expected at most {largest:.2f} m in this room, "
+                        f"{source.name}: distance: expected at most {largest:g} m in this room, "
                         f"got {source.distance:g}; set the distance of the source, or a larger room"
                     )
         for source in self.sources if self.head.front_only else ():

@@ -164,8 +164,8 @@ def test_a_room_depends_on_the_seed_and_not_on_chunks(tmp_path: Path) -> None:
         ("{rt60: 0.4, size: [6, 5]}", "room: size: expected three sides in m, got (6.0, 5.0)"),
         ("{rt60: 0.4, size: 6}", "room: size: expected three sides in m, got (6.0,)"),
         ("{rt60: 0.4, size: [6, 5, 0.5]}", "room: size: expected a number from 1 to 30, got '0.5'"),
-        ("{rt60: 0.1, size: [30, 30, 30]}", "room: rt60: expected at least 0.17 s in a room of this size, got 0.1"),
-        ("{rt60: 0.4, size: [3, 2.5, 3]}", "a: distance: expected at most 1.20 m in this room, got 1.5"),
+        ("{rt60: 0.1, size: [30, 30, 30]}", "room: rt60: expected at least 0.18 s in a room of this size, got 0.1"),
+        ("{rt60: 0.4, size: [3, 2.5, 3]}", "a: distance: expected at most 1.2 m in this room, got 1.5"),
     ],
 )
 def test_unsuitable_rooms_are_rejected(tmp_path: Path, room: str, message: str) -> None:
