@@ -16,9 +16,9 @@ from rosafe.processing.stream import Stream
 from rosafe.representations import STAGES
 
 KINDS = ("itd", "ild", "ic", "ratemap")  # the representations that localization needs
-# Sound is amplified by 100 dB: the representations add a small constant to energies, which would matter at low levels.
+# Sound is amplified by 140 dB: the representations add a small constant to energies, which would matter at low levels.
 # The high-pass removes a constant offset of the microphones and most of mains hum; see `rosafe.localization.hum`.
-PARAMETERS = {"pp_bLevelScaling": True, "pp_refSPLdB": 0.0, "pp_bRemoveDC": True, "pp_cutoffHzDC": 150.0}
+PARAMETERS = {"pp_bLevelScaling": True, "pp_refSPLdB": -40.0, "pp_bRemoveDC": True, "pp_cutoffHzDC": 150.0}
 ITD_BINS, MAX_ITD = 67, 1.1e-3  # of the histogram from -MAX_ITD to MAX_ITD, s, for a head
 ILD_BINS, MAX_ILD = 61, 30.0  # dB
 COHERENCE_CLASSES = 6
