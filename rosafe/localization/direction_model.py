@@ -47,8 +47,8 @@ FORMAT = "rosafe direction model 1"
 WINDOW = 100  # frames for which a floor is estimated while learning
 _SMOOTHING = 0.75  # bins, along ITD and ILD
 _CLASS_SMOOTHING = 0.5  # classes
-# Weights of ITD and ILD in the first coherence classes and in the others, at `_WEIGHT_HZ`. They maximize the posterior of
-# the right direction in 2,000 windows of 0.5 and 1 s: training sounds of KEMAR, with and without rooms, not counted.
+# Weights of ITD and ILD in the first coherence classes and in the others, at `_WEIGHT_HZ`. They maximize the posterior
+# of the right direction in 2,000 windows of 0.5 and 1 s: training sounds of KEMAR, with and without rooms, not counted.
 _COHERENT = 2  # classes
 _WEIGHT_HZ = np.array([80, 198, 361, 587, 899, 1330, 1926, 2750, 3890, 5464, 7641])
 _WEIGHTS = np.array(
