@@ -38,7 +38,7 @@ def kemar_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not path.exists():
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(training, "SOUND_SECONDS", 400.0)
+                patch.setattr(training, "SOUND_SECONDS", 800.0)
                 training.learn_head(Head.from_sofa(KEMAR), RATE).save(path)
     return path
 
