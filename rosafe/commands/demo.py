@@ -415,7 +415,7 @@ def _directions(sound: DemoSound, port: _Port) -> tuple[dict[str, Any] | None, d
 
     scene = getattr(sound.source, "scene", None)
     head = SPHERE if scene is None else scene.head
-    say("\nlocalizing; at the first use of a head and sample rate, they are learned, which takes up to 30 s")
+    say("\nlocalizing; at the first use of a head and sample rate, they are learned, which takes up to a minute")
     try:
         found = localize(np.concatenate(port.pieces, axis=-1), sound.sample_rate, head, WINDOW_SECONDS)
     except ValueError as problem:

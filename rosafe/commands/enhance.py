@@ -48,7 +48,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, "rosafe process -h lists them")
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     parser.epilog = (
-        "The first use of a head, sample rate and parameters takes up to 30 s: a model is learned and kept in\n"
+        "The first use of a head, sample rate and parameters takes up to a minute: a model is learned and kept in\n"
         "$XDG_CACHE_HOME/rosafe. docs/resynthesis.md describes the method and its effect.\n\n"
         "example:\n"
         "  rosafe enhance talkers.wav --azimuth 0 --head /usr/share/libmysofa/default.sofa -o front.wav"

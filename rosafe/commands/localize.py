@@ -73,7 +73,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     _add_node(parser)
     parser.epilog = (
-        "The first use of a head, sample rate and parameters takes up to 30 s: a model is learned and kept in\n"
+        "The first use of a head, sample rate and parameters takes up to a minute: a model is learned and kept in\n"
         "$XDG_CACHE_HOME/rosafe. docs/localization.md describes the method and its accuracy.\n\n"
         "examples:\n"
         "  rosafe localize speech.wav --head /usr/share/libmysofa/default.sofa\n"

@@ -4,7 +4,8 @@ T. May, S. van de Par and A. Kohlrausch (2011), "A probabilistic model for robus
 auditory front-end", IEEE Trans. Audio Speech Lang. Process. 19, 1-13, learn the joint distribution of ITD and ILD
 of each channel in several conditions. Here ITD and ILD are independent histograms, conditional on the interaural
 coherence and on the level of the channel above its floor in the window. Both depend on the noise and
-reverberation in a frame and determine how much its cues count.
+reverberation in a frame and determine how much its cues count. Neighbouring frames and channels, and both cues, are not
+independent: each counts with a weight.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from scipy.ndimage import gaussian_filter1d
 from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import short_repr
 from rosafe.dsp import kernels
+from rosafe.dsp.erb import erb_rate
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles, cues
 from rosafe.localization.cues import (
@@ -45,6 +47,18 @@ FORMAT = "rosafe direction model 1"
 WINDOW = 100  # frames for which a floor is estimated while learning
 _SMOOTHING = 0.75  # bins, along ITD and ILD
 _CLASS_SMOOTHING = 0.5  # classes
+# Weights of ITD and ILD in the first coherence classes and in the others, at `_WEIGHT_HZ`. They maximize the posterior
+# of the right direction in 2,000 windows of 0.5 and 1 s: training sounds of KEMAR, with and without rooms, not counted.
+_COHERENT = 2  # classes
+_WEIGHT_HZ = np.array([80, 198, 361, 587, 899, 1330, 1926, 2750, 3890, 5464, 7641])
+_WEIGHTS = np.array(
+    [
+        [[0.04, 0.07, 0.15, 0.64, 1.43, 2.41, 4.51, 3.88, 2.24, 1.5, 1.23],
+         [0.08, 0.08, 0.08, 0.13, 0.17, 0.42, 0.69, 1.61, 2.78, 0.35, 0.56]],
+        [[0.11, 0.28, 0.32, 0.22, 0.24, 0.39, 0.92, 2.72, 6.35, 11.78, 11.28],
+         [0.12, 0.12, 0.09, 0.06, 0.05, 0.05, 0.03, 0.03, 0.09, 0.17, 0.19]],
+    ]
+)  # fmt: skip
 _PRIOR_COUNT = 10.0  # frames that the distribution over all directions counts for
 HUM_PART = 16.0  # frames of hum for each one of sound
 HUM_CLASSES = 4  # of coherence, in which hum is counted: independent noise is below
@@ -275,15 +289,24 @@ class Histograms:
         self.itd += self.itd[source][..., ::-1]
         self.ild += self.ild[source][..., ::-1]
 
-    def tables(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tables of log-likelihood ratios for ITD and ILD."""
-        return _log_ratios(self.itd, self._hum_itd), _log_ratios(self.ild, self._hum_ild)
+    def tables(self, frequencies: FloatArray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the tables of weighted log-likelihood ratios for ITD and ILD; `frequencies` (C,) in Hz."""
+        itd, ild = _weights(frequencies)
+        return _log_ratios(self.itd, self._hum_itd, itd), _log_ratios(self.ild, self._hum_ild, ild)
 
 
-def _log_ratios(counts: np.ndarray, hum: np.ndarray) -> np.ndarray:
+def _weights(frequencies: FloatArray) -> FloatArray:
+    """Return the weights (2, C, K) of ITD and ILD for channels and coherence classes."""
+    places = erb_rate(np.asarray(frequencies)), erb_rate(_WEIGHT_HZ)
+    cues_of = [[np.exp(np.interp(*places, np.log(one))) for one in cue] for cue in _WEIGHTS]  # (2, 2, C)
+    return np.repeat(np.moveaxis(np.array(cues_of), 1, 2), (_COHERENT, COHERENCE_CLASSES - _COHERENT), axis=2)
+
+
+def _log_ratios(counts: np.ndarray, hum: np.ndarray, weights: FloatArray) -> np.ndarray:
     """Return log(p(bin | direction) / p(bin)) of counts (A, C, K, S, bins) as (C * K * S * bins + 1, A).
 
     The ratio is weighted with the probability that the cues are not those of hum, which has counts (1, C, K, S, bins).
+    The logarithms are multiplied by the `weights` (C, K), but not beyond what a file may contain.
     """
     smooth, hum = _smoothed(counts), _smoothed(hum)[0]
     mean = smooth.sum(axis=0) + 1e-4
@@ -298,7 +321,9 @@ def _log_ratios(counts: np.ndarray, hum: np.ndarray) -> np.ndarray:
     smooth *= sound
     smooth += 1.0
     table = np.zeros((mean.size + 1, len(counts)), np.float32)
-    np.log(smooth.reshape(len(counts), -1).T, out=table[:-1])
+    np.log(smooth, out=smooth)
+    smooth *= weights[..., np.newaxis, np.newaxis].astype(np.float32)
+    table[:-1] = np.clip(smooth.reshape(len(counts), -1).T, -MAX_LOG_RATIO, MAX_LOG_RATIO)
     return table
 
 

@@ -41,7 +41,7 @@ def localize(
     head : Head or str or Path
         `"sphere"`, `"pair:0.058"` (microphones with this spacing in m), a head, or the path of a SOFA file or of a
         model that `rosafe head learn` has written. A model is learned at the first use of a head, sample rate and
-        parameters; this takes up to 30 s.
+        parameters; this takes up to a minute.
     seconds : float
         Length of the window of integration.
     parameters : mapping, optional

@@ -131,7 +131,7 @@ class Models:
         self._head = open_head(settings.head, settings.mirror)
 
     def model_for(self, sample_rate: float) -> DirectionModel:
-        """Return the model for a sample rate. It is learned if there is none, which takes up to 30 s on two cores."""
+        """Return the model for a sample rate. It is learned if there is none, in up to a minute on two cores."""
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)  # of this thread only: sound comes first
         try:
             return find_model(self._head, sample_rate, self._parameters, self.report)
