@@ -222,7 +222,8 @@ class Sound:
         stamp = {"sec": 0, "nsec": 1e9 * max(0.0, seconds)}
         window = _Window(new.sample_rate, 1, new.frames_per_chunk, index, new.left, new.right, stamp)
         if new.time_ns:
-            self._line = self.ring.captured(index) or self._line
+            known = self.ring.captured(index) if index > new.frames_per_chunk else None
+            self._line = known or LinearClock(index, seconds, new.sample_rate)
         self._feed(window)
 
     def clock_time(self, seconds: float) -> float:

@@ -7,7 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.localization.conftest import sphere_model
+
 from .network import Network, network, variables
+
+__all__ = ["sphere_model"]
 
 
 @pytest.fixture(scope="session")
