@@ -49,6 +49,10 @@ class _Frame:
         while turns[0].time < turns[-1].time - CACHE_SECONDS:
             turns.popleft()
 
+    def is_long_after(self, time: float) -> bool:
+        """Return whether the time has jumped back."""
+        return not self.static and bool(self.turns) and self.turns[-1].time - time > CACHE_SECONDS
+
     def at(self, time: float) -> Quaternion | None:
         """Return the rotation at a time in s, interpolated; None outside of the known times."""
         turns = self.turns
@@ -95,11 +99,8 @@ class RotationBuffer:
         """Add the rotation of `child` relative to `parent` at a clock time in s."""
         child, parent = child.lstrip("/"), parent.lstrip("/")
         norm = math.sqrt(sum(min(abs(part), 1e3) ** 2 for part in rotation))
-        if (
-            not (child and parent and child != parent and max(len(child), len(parent)) <= MAX_NAME)
-            or not abs(norm * norm - 1) < _NORM_TOLERANCE
-            or not math.isfinite(time)
-        ):
+        named = child and parent and child != parent and max(len(child), len(parent)) <= MAX_NAME
+        if not named or not abs(norm * norm - 1) < _NORM_TOLERANCE or not math.isfinite(time):
             name = child[:MAX_NAME].encode("ascii", "replace").decode()
             self._report(f"/tf: the transform of {name!r} is not valid and ignored", "invalid")
             return
@@ -111,7 +112,7 @@ class RotationBuffer:
                 return
             if frame is None or frame.parent != parent or frame.static != static:
                 frame = self._frames[child] = _Frame(parent, static)
-            if not static and frame.turns and frame.turns[-1].time - time > CACHE_SECONDS:  # time has jumped back
+            if frame.is_long_after(time):
                 self._clear()
             frame.add(Turn(time, (x / norm, y / norm, z / norm, w / norm)))
 

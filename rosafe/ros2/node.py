@@ -6,7 +6,6 @@ import contextlib
 import functools
 import importlib
 import json
-import math
 import os
 import re
 import signal
@@ -27,7 +26,6 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rosafe_msgs.msg import Processor as ProcessorMessage
-from rosafe_msgs.msg import SceneTruth
 from rosafe_msgs.srv import (
     Acquire,
     AddProcessor,
@@ -39,7 +37,6 @@ from rosafe_msgs.srv import (
 )
 from std_srvs.srv import Trigger
 
-from rosafe.audio.devices.base import wall_time_ns
 from rosafe.declarations.text import did_you_mean, join_names
 from rosafe.dsp import kernels
 from rosafe.interface import BASS, BLOCK_AND_BUFFERS, ComponentError, format_value
@@ -50,9 +47,9 @@ from rosafe.localization.status import NodeStatus
 from rosafe.representations import PROBLEMS, WARNINGS
 from rosafe.ros2 import transforms
 from rosafe.ros2.localization import Localization, SourcePublishers
-from rosafe.ros2.messages import diagnostics, ros_time
+from rosafe.ros2.messages import diagnostics
 from rosafe.ros2.node_tree import NodeTree
-from rosafe.ros2.outputs import QUEUE, Outputs, topics_of
+from rosafe.ros2.outputs import Outputs, topics_of
 from rosafe.ros2.parameters import ProcessorParameters
 from rosafe.ros2.sound import Sound
 from rosafe.ros2.sound_topic import open_device
@@ -104,19 +101,25 @@ class RosafeNode:
         log = self.node.get_logger()
         for remark in (*(f"left out: {problem}" for problem in PROBLEMS), *WARNINGS):
             log.warning(f"plugin {remark}")
-        self._truth = self.node.create_publisher(SceneTruth, "~/scene_truth", QoSProfile(depth=QUEUE))
-        self._head_transform: transforms.HeadTransform | None = None
-        self.sound = Sound(self.now, log, self._publish_truth, functools.partial(open_device, self.node))
-        self._changed = self.node.create_guard_condition(self._update)
-        outputs = Outputs(self.node, self.sound, self._changed.trigger)
+        frames = self._values["world_frame"] or WORLD, self._values["frame_id"]
+        truth = transforms.TruthTopics(self.node, frames, self.now)
+        self.sound = Sound(self.now, log, truth.publish, functools.partial(open_device, self.node))
+        changed = self.node.create_guard_condition(self._update)
+        outputs = Outputs(self.node, self.sound, changed.trigger)
         self.tree = NodeTree(outputs, self.sound, self._values["frames_per_block"], TOPICS, log)
-        self._parameters = ProcessorParameters(self.node, self.tree.tree, given, self._changed.trigger)
+        self._parameters = ProcessorParameters(self.node, self.tree.tree, given, changed.trigger)
         self._sound_settings: AcquireSettings | None = None
         self._lock = threading.Lock()  # of the services, which wait until the node has begun
         self._pending: list[Callable[[], object]] = []  # to do with the first sound
         self._localizer: Mapping[str, Any] | None = None  # its settings
         self._localization: Localization | None = None
-        self._status = NodeStatus(lambda: None, {OK: log.info, WARN: log.warning, ERROR: log.error})
+        # each with a line of its own: rclpy accepts one severity for each line that logs
+        severities = {
+            OK: lambda text: log.info(text),
+            WARN: lambda text: log.warning(text),
+            ERROR: lambda text: log.error(text),
+        }
+        self._status = NodeStatus(lambda: None, severities)
         self._keep = self._kept()
         self._serve()
         self._diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
@@ -161,12 +164,7 @@ class RosafeNode:
         kernels.compiled()  # before the first block, which would be late otherwise
         importlib.import_module("scipy.signal")
         values = self._values
-        path, device = values["setup"], values["device"]
-        setup = Setup()
-        if path:
-            setup = read(read_regular(Path(os.path.expanduser(path)), 2**24).decode())
-        elif self._keep is not None:
-            setup = self._keep.saved()
+        device, setup = values["device"], self._start_setup()
         for representation in values["representations"]:
             kind_of(representation)
             self._pending.append(functools.partial(self.tree.request, representation, {}))
@@ -181,6 +179,12 @@ class RosafeNode:
         elif setup.sound is not None:
             self._acquire_settings(setup.sound, setup)
         self._update()
+
+    def _start_setup(self) -> Setup:
+        """Return the setup to begin with: that of the parameter, or else the kept one."""
+        if path := self._values["setup"]:
+            return read(read_regular(Path(os.path.expanduser(path)), 2**24).decode())
+        return Setup() if self._keep is None else self._keep.saved()
 
     def close(self) -> None:
         """End all threads; the kept setup stays as it is."""
@@ -215,19 +219,6 @@ class RosafeNode:
         del self._pending[: len(pending)]
         arguments = {"device": device, "sampleRate": rate, "nFramesPerChunk": frames}
         self._sound_settings = AcquireSettings.of(arguments)
-
-    def _publish_truth(self, frame: int, moment: float, truth: Any) -> None:
-        seconds = self.sound.clock_time(wall_time_ns(moment) / 1e9)
-        yaw = math.radians(truth.head_yaw)
-        if self._truth.get_subscription_count():
-            azimuths = [math.radians(azimuth) for azimuth in truth.azimuths]
-            message = SceneTruth(stamp=ros_time(seconds), frame_index=frame, head_yaw=yaw, azimuths=azimuths)
-            message.names = list(truth.names)
-            self._truth.publish(message)
-        if self._head_transform is None:
-            world = self._values["world_frame"] or WORLD
-            self._head_transform = transforms.HeadTransform(self.node, world, self._values["frame_id"])
-        self._head_transform.publish(seconds, yaw)
 
     # --- localizer ---
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosafe_msgs.msg import SceneTruth
 from tf2_msgs.msg import TFMessage
 
 from rosafe.localization.rotations import RotationBuffer
@@ -26,30 +28,42 @@ def _adding(buffer: RotationBuffer, static: bool) -> Callable[[Any], None]:
     def add(message: Any) -> None:
         for one in message.transforms:
             stamp, turn = one.header.stamp, one.transform.rotation
-            time = stamp.sec + 1e-9 * stamp.nanosec
-            buffer.add(one.child_frame_id, one.header.frame_id, time, (turn.x, turn.y, turn.z, turn.w), static)
+            seconds = stamp.sec + 1e-9 * stamp.nanosec
+            buffer.add(one.child_frame_id, one.header.frame_id, seconds, (turn.x, turn.y, turn.z, turn.w), static)
 
     return add
 
 
-class HeadTransform:
-    """Publishes the rotation of the head of a scene.
+class TruthTopics:
+    """Publishes the truth of a scene, and the rotation of its head on /tf, whose publisher the first one creates.
 
     Parameters
     ----------
     node : Node
-    world, head : str
-        Names of the coordinate frames.
+    frames : tuple of two str
+        Names of the coordinate frames of the world and of the head.
+    now : callable
+        Returns the clock time of the node in s.
     """
 
-    def __init__(self, node: Node, world: str, head: str) -> None:
-        self._publisher = node.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
-        self._transform = TransformStamped(child_frame_id=head)
-        self._transform.header.frame_id = world
+    def __init__(self, node: Node, frames: tuple[str, str], now: Callable[[], float]) -> None:
+        self._node, self._now = node, now
+        self._truth = node.create_publisher(SceneTruth, "~/scene_truth", QoSProfile(depth=5))
+        self._rotation: Any = None
+        self._transform = TransformStamped(child_frame_id=frames[1])
+        self._transform.header.frame_id = frames[0]
 
-    def publish(self, time: float, yaw: float) -> None:
-        """Publish a rotation about the z axis (rad) at a clock time in s."""
-        self._transform.header.stamp = ros_time(time)
+    def publish(self, frame: int, moment: float, truth: Any) -> None:
+        """Publish the truth at an audio frame, whose time is on the clock of time.monotonic."""
+        stamp = ros_time(self._now() - (time.monotonic() - moment))
+        yaw = math.radians(truth.head_yaw)
+        azimuths = [math.radians(azimuth) for azimuth in truth.azimuths]
+        message = SceneTruth(stamp=stamp, frame_index=frame, head_yaw=yaw, azimuths=azimuths)
+        message.names = list(truth.names)
+        self._truth.publish(message)
+        if self._rotation is None:
+            self._rotation = self._node.create_publisher(TFMessage, "/tf", QoSProfile(depth=100))
+        self._transform.header.stamp = stamp
         rotation = self._transform.transform.rotation
         rotation.z, rotation.w = math.sin(yaw / 2), math.cos(yaw / 2)
-        self._publisher.publish(TFMessage(transforms=[self._transform]))
+        self._rotation.publish(TFMessage(transforms=[self._transform]))

@@ -104,8 +104,7 @@ def test_sound_of_another_driver(ros2: Network, tmp_path: Path) -> None:
                 return
             driver.ask("publish", kind="audio_common_msgs/msg/AudioDataStamped", topic="/audio", fields=fields)
 
-    thread = threading.Thread(target=drive)
-    thread.start()
+    threading.Thread(target=drive, daemon=True).start()
     try:
         wait_for(lambda: "/audio" in client.ask("topics"))
         assert client.call("acquire", device="topic:/audio?format=S16LE&rate=16000&of=2") == {
@@ -115,5 +114,4 @@ def test_sound_of_another_driver(ros2: Network, tmp_path: Path) -> None:
         found = joined(client.take("ild", 40))
     finally:
         finished.set()
-        thread.join()
     assert np.allclose(found[:, 5:], -20 * np.log10(2), atol=0.01)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -64,7 +64,9 @@ def test_a_lost_device_is_acquired_again_and_the_frames_between_are_lost(monkeyp
     sound = Sound(lambda: 0.0, log, lambda *_: None, open_device)
     with pytest.raises(ComponentError, match="no sound: call ~/acquire"):
         sound.open_input(_new_input(), lambda source: None)
-    sound.acquire("scripted", 0, CHUNK, lambda rate: None, lambda: sound.open_input(_new_input(), lambda _: True))
+    sound.acquire(
+        "scripted", 0, CHUNK, lambda rate: None, lambda: sound.open_input(_new_input(), lambda _: cast(Any, True))
+    )
     wait_for(lambda: any("the acquisition has ended" in line for line in lines))
     assert opened == [0, RATE, RATE]
     samples = _read(sound, sound.ring.frames.newest // CHUNK * CHUNK)
