@@ -408,5 +408,13 @@ def _run(stop: threading.Event) -> None:
         node.node.destroy_node()
 
 
+def run() -> None:
+    """Run the node as a program. It ends at once: the destructors of the middleware can take longer than 2 s."""
+    code = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    run()

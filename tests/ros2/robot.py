@@ -15,7 +15,6 @@ import time
 from typing import Any
 
 import rclpy
-from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 
@@ -91,7 +90,6 @@ class Robot:
         while publisher.get_subscription_count() < matched:
             rclpy.spin_once(self.node, timeout_sec=0.02)
         publisher.publish(fill(find(kind)(), fields))
-        publisher.wait_for_all_acked(Duration(seconds=5))
 
     def call(self, kind: str, name: str, fields: Any, seconds: float = 40.0) -> Any:
         """Call a service."""
