@@ -125,6 +125,8 @@ def room_tail(head: Head, dry: np.ndarray, drr_db: float, seed: int) -> np.ndarr
 def si_sdr(estimate: np.ndarray, reference: np.ndarray) -> float:
     scale = np.sum(estimate * reference) / np.sum(reference**2)
     rest = estimate - scale * reference
+    if not rest.any():
+        return float("inf")
     return float(10 * np.log10(np.sum((scale * reference) ** 2) / np.sum(rest**2)))
 
 
@@ -183,9 +185,8 @@ def section_talkers(head: Head, voices: dict[str, np.ndarray], pairs: int) -> li
         tracks = rosafe.localize(ears, RATE, head, streams=True)["tracks"]
         ones.append(improvement(tracks, (0.0, 60.0, -40.0)[number % 3], low(ears), low(ears))[:1])
     values = np.array([one[0] for one in ones if one])
-    lines.append(
-        f"| one talker, no room | {values.mean():.1f} ({values.min():.1f} to {values.max():.1f}) | | | {len(values)} of {len(ones)} |"
-    )
+    span = f"{values.mean():.1f} ({values.min():.1f} to {values.max():.1f})"
+    lines.append(f"| one talker, no room | {span} | | | {len(values)} of {len(ones)} |")
     print(lines[-1], flush=True)
     return lines
 
@@ -218,9 +219,8 @@ def half_seconds(tracks: list[dict[str, Any]], talk: np.ndarray, azimuths: tuple
     """Return hits, missed and false half seconds of both sources, from the time on at which each is present."""
     counts = np.zeros(3, int)
     for place, azimuth in enumerate(azimuths):
-        known = sorted(
-            (t, s) for one in nearest(tracks, azimuth) for t, s in zip(one["time"], one["speech"], strict=True)
-        )
+        near = nearest(tracks, azimuth)
+        known = sorted(pair for one in near for pair in zip(one["time"], one["speech"], strict=True))
         for end in np.arange(0.5, SECONDS + 0.01, 0.5):
             values = [s for t, s in known if abs(t - end) < 0.06 and np.isfinite(s)]
             frames = talk[round((end - 0.5) * RATE) : round(end * RATE)][: 50 * 441].reshape(-1, 441)
@@ -266,15 +266,14 @@ def main() -> None:
     found = {name: voice(options.speech / path) for name, path in VOICES.items()}
     voices = {name: sound for name, sound in found.items() if sound is not None}
     if len(voices) < 2:
-        raise SystemExit(
-            "expected recorded speech below /usr/share: apt install asterisk-core-sounds-en-wav pocketsphinx-testdata alsa-utils"
-        )
+        packages = "asterisk-core-sounds-en-wav pocketsphinx-testdata alsa-utils"
+        raise SystemExit(f"expected recorded speech below {options.speech}: apt install {packages}")
     head = Head.from_sofa(KEMAR)
     text = (
         "# Streams of sources\n\nMeasured by benchmarks/streams_per_source.py; method: docs/resynthesis.md. Sources "
         f"have equal levels, {SECONDS:g} s each, 44.1 kHz, KEMAR, talkers {', '.join(voices)}. Rooms: diffuse "
-        f"reverberation of {ROOM_RT60:g} s, by its direct-to-reverberant ratio; the direct sound is the reference. SI-SDR "
-        "in dB, mean and range; F1 of the half seconds of both sources, from the first second on.\n"
+        f"reverberation of {ROOM_RT60:g} s, by its direct-to-reverberant ratio; the direct sound is the reference. "
+        "SI-SDR in dB, mean and range; F1 of the half seconds of both sources, from the first second on.\n"
     )
     sections: dict[str, Callable[[], list[str]]] = {
         "Cost and delay": lambda: section_cost(head, voices),
