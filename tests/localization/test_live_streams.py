@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Iterator
@@ -93,7 +94,9 @@ def test_times_numbers_and_ids(session: Session, sphere_model: Path, ears: np.nd
     wait_for(lambda: sound.at_end, what="the end of the sound")
     assert {part.id for part, _ in session.parts} == {11}
     first = [(part, moment) for part, moment in session.parts[:50]]
-    assert all(part.first_sample == 320 * number for number, (part, _) in enumerate(first))
+    assert first[0][0].first_sample == 0
+    for (before, _), (after, _) in itertools.pairwise(first):
+        assert after.first_sample == before.first_sample + len(before.samples)
     heard = np.concatenate([part.samples for part, _ in first])[RATE // 10 :] / 2**15
     begin = round((first[0][1] - CLOCK) * RATE) + RATE // 10
     truth = ears[0, begin : begin + len(heard)]
