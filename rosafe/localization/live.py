@@ -405,6 +405,13 @@ class Publishing(Protocol):
         """Publish the state at a clock time (s): the tracks, from their power to their level, grid and posterior."""
 
 
+class _Callbacks(NamedTuple):
+    """Functions that the loop calls; see `LocalizationLoop`."""
+
+    suspicious: Callable[[], None]
+    updated: Callable[[float, Sequence[Track], float], None]
+
+
 class LocalizationLoop:
     """Localizes and publishes, on a thread of its own, from `start` to `close`.
 
@@ -435,12 +442,11 @@ class LocalizationLoop:
         updated: Callable[[float, Sequence[Track], float], None] = lambda time, tracks, yaw: None,
     ) -> None:
         self._localizer_for = localizer_for
-        self._updated = updated
         self._publishing = publishing
         self._clock = clock
         self._queue = queue
         self._status = status
-        self._suspicious = suspicious
+        self._callbacks = _Callbacks(suspicious, updated)
         self._arrived = threading.Event()
         self._closing = False
         self._lock = threading.Lock()  # of the link
@@ -538,7 +544,7 @@ class LocalizationLoop:
             return False
         if source.problem:
             self._status.set("frames", WARN, f"messages of rosAFE cannot be used: {source.problem}")
-            self._suspicious()
+            self._callbacks.suspicious()
         if new is not None:
             self._append(new, localizer)
         used = self._queue.take(least)
@@ -566,7 +572,7 @@ class LocalizationLoop:
         self._status.value("directions of steady noise (degrees)", steady or "none")
         self._estimate = result["azimuths"], result["posterior"][0]
         self._newest, self._used_at = float(result["time"][0]), time.monotonic()
-        self._updated(localizer.updated_at, localizer.sources, float(used.yaw[-1]))
+        self._callbacks.updated(localizer.updated_at, localizer.sources, float(used.yaw[-1]))
         return True
 
     def _append(self, new: NewFrames, localizer: Localizer) -> None:
