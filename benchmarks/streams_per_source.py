@@ -125,6 +125,8 @@ def room_tail(head: Head, dry: np.ndarray, drr_db: float, seed: int) -> np.ndarr
 def si_sdr(estimate: np.ndarray, reference: np.ndarray) -> float:
     scale = np.sum(estimate * reference) / np.sum(reference**2)
     rest = estimate - scale * reference
+    if not rest.any():
+        return float("inf")
     return float(10 * np.log10(np.sum((scale * reference) ** 2) / np.sum(rest**2)))
 
 
@@ -183,30 +185,27 @@ def section_talkers(head: Head, voices: dict[str, np.ndarray], pairs: int) -> li
         tracks = rosafe.localize(ears, RATE, head, streams=True)["tracks"]
         ones.append(improvement(tracks, (0.0, 60.0, -40.0)[number % 3], low(ears), low(ears))[:1])
     values = np.array([one[0] for one in ones if one])
-    lines.append(
-        f"| one talker, no room | {values.mean():.1f} ({values.min():.1f} to {values.max():.1f}) | | | {len(values)} of {len(ones)} |"
-    )
+    span = f"{values.mean():.1f} ({values.min():.1f} to {values.max():.1f})"
+    lines.append(f"| one talker, no room | {span} | | | {len(values)} of {len(ones)} |")
     print(lines[-1], flush=True)
     return lines
 
 
 def section_speech(head: Head, voices: dict[str, np.ndarray]) -> list[str]:
-    lines = ["| scene | F1 | hits | missed | false alarms |", "|---|--:|--:|--:|--:|"]
+    lines = ["| scene | F1 while tracked | F1 | hits | missed, of these not tracked | false alarms |"]
+    lines.append("|---|--:|--:|--:|--:|--:|")
     names = list(voices)
     for room, drr in (("no room", None), ("room, 5 dB", 5.0), ("room, 0 dB", 0.0)):
-        total = np.zeros(3, int)
+        total = np.zeros(4, int)
         for number, (kind, other) in enumerate(OTHERS.items()):
-            counts = np.zeros(3, int)
-            for turn in range(2):
-                talk = excerpt(voices[names[(2 * number + turn) % len(names)]], number)
-                for begin in (2.0, 4.5):
-                    talk[round(begin * RATE) : round((begin + 1.0) * RATE)] = 0
-                dry, azimuths = (talk, scaled(other(number))), ((0.0, 60.0), (60.0, 0.0))[turn]
-                mixture = sum(head.render(one, RATE, azimuth) for one, azimuth in zip(dry, azimuths, strict=True))
-                if drr is not None:
-                    mixture = mixture + sum(room_tail(head, one, drr, 7 + n) for n, one in enumerate(dry))
-                tracks = rosafe.localize(mixture, RATE, head, streams=True)["tracks"]
-                counts += half_seconds(tracks, talk, azimuths)
+            talk = excerpt(voices[names[number % len(names)]], number)
+            talk[round(3.0 * RATE) : round(4.0 * RATE)] = 0
+            dry, azimuths = (talk, scaled(other(number))), ((0.0, 60.0), (60.0, 0.0))[number % 2]
+            mixture = sum(head.render(one, RATE, azimuth) for one, azimuth in zip(dry, azimuths, strict=True))
+            if drr is not None:
+                mixture = mixture + sum(room_tail(head, one, drr, 7 + n) for n, one in enumerate(dry))
+            tracks = rosafe.localize(mixture, RATE, head, streams=True)["tracks"]
+            counts = half_seconds(tracks, talk, azimuths)
             total += counts
             lines.append(row(f"talker and {kind}, {room}", counts))
         lines.append(row(f"**all, {room}**", total))
@@ -215,25 +214,27 @@ def section_speech(head: Head, voices: dict[str, np.ndarray]) -> list[str]:
 
 
 def half_seconds(tracks: list[dict[str, Any]], talk: np.ndarray, azimuths: tuple[float, ...]) -> np.ndarray:
-    """Return hits, missed and false half seconds of both sources, from the time on at which each is present."""
-    counts = np.zeros(3, int)
+    """Return hits, misses with and without a track, and false half seconds of both sources, from 1 s on."""
+    counts = np.zeros(4, int)
     for place, azimuth in enumerate(azimuths):
-        known = sorted(
-            (t, s) for one in nearest(tracks, azimuth) for t, s in zip(one["time"], one["speech"], strict=True)
-        )
-        for end in np.arange(0.5, SECONDS + 0.01, 0.5):
-            values = [s for t, s in known if abs(t - end) < 0.06 and np.isfinite(s)]
+        near = nearest(tracks, azimuth)
+        known = sorted(pair for one in near for pair in zip(one["time"], one["speech"], strict=True))
+        for end in np.arange(1.5, SECONDS + 0.01, 0.5):
+            values = [speech for moment, speech in known if abs(moment - end) < 0.06 and np.isfinite(speech)]
             frames = talk[round((end - 0.5) * RATE) : round(end * RATE)][: 50 * 441].reshape(-1, 441)
             active = bool(np.mean(np.mean(frames**2, axis=1) > LEVEL**2 * 1e-3) > 0.5) and place == 0
             speaks = bool(values) and values[0] > SPEAKS
-            if end > 1.0 or values:  # a source is found within a second
-                counts += np.array([active and speaks, active and not speaks, speaks and not active])
+            missed = active and not speaks
+            counts += np.array(
+                [active and speaks, missed and bool(values), missed and not values, speaks and not active]
+            )
     return counts
 
 
 def row(name: str, counts: np.ndarray) -> str:
-    hits, missed, false = counts
-    return f"| {name} | {2 * hits / max(1, 2 * hits + missed + false):.2f} | {hits} | {missed} | {false} |"
+    hits, missed, absent, false = counts
+    tracked, whole = (2 * hits / max(1, 2 * hits + misses + false) for misses in (missed, missed + absent))
+    return f"| {name} | {tracked:.2f} | {whole:.2f} | {hits} | {missed + absent}, {absent} | {false} |"
 
 
 def section_cost(head: Head, voices: dict[str, np.ndarray]) -> list[str]:
@@ -252,7 +253,7 @@ def section_cost(head: Head, voices: dict[str, np.ndarray]) -> list[str]:
         late += [(begin + 882) / RATE - part.time - len(part.samples) / STREAM_RATE for part in parts]
     return [
         f"Streams and speech of two sources: {used / SECONDS:.2f} s of processor time per second of sound.",
-        f"Last sample of a part before the end of a block of 20 ms: {1000 * min(late):.0f} to {1000 * max(late):.0f} ms.",
+        f"Delay of the newest sample after a block of 20 ms: {1000 * min(late):.0f} to {1000 * max(late):.0f} ms.",
     ]
 
 
@@ -266,15 +267,14 @@ def main() -> None:
     found = {name: voice(options.speech / path) for name, path in VOICES.items()}
     voices = {name: sound for name, sound in found.items() if sound is not None}
     if len(voices) < 2:
-        raise SystemExit(
-            "expected recorded speech below /usr/share: apt install asterisk-core-sounds-en-wav pocketsphinx-testdata alsa-utils"
-        )
+        packages = "asterisk-core-sounds-en-wav pocketsphinx-testdata alsa-utils"
+        raise SystemExit(f"expected recorded speech below {options.speech}: apt install {packages}")
     head = Head.from_sofa(KEMAR)
     text = (
         "# Streams of sources\n\nMeasured by benchmarks/streams_per_source.py; method: docs/resynthesis.md. Sources "
         f"have equal levels, {SECONDS:g} s each, 44.1 kHz, KEMAR, talkers {', '.join(voices)}. Rooms: diffuse "
-        f"reverberation of {ROOM_RT60:g} s, by its direct-to-reverberant ratio; the direct sound is the reference. SI-SDR "
-        "in dB, mean and range; F1 of the half seconds of both sources, from the first second on.\n"
+        f"reverberation of {ROOM_RT60:g} s, by its direct-to-reverberant ratio; the direct sound is the reference. "
+        "SI-SDR in dB, mean and range; F1 of the half seconds of both sources, from the first second on.\n"
     )
     sections: dict[str, Callable[[], list[str]]] = {
         "Cost and delay": lambda: section_cost(head, voices),

