@@ -150,7 +150,7 @@ def memory(minutes: float) -> list[list[str]]:
 
 
 def main() -> None:
-    """Measure and write benchmarks/results/ros2.md."""
+    """Measure and write the report."""
     parser = arguments(str(__doc__).partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=60.0, help="of each measurement (default %(default)g)")
     parser.add_argument(

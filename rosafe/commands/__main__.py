@@ -37,9 +37,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run `rosafe` and return its exit code. SystemExit: 2 for a wrong command line, 0 after -h and --version."""
     name = "rosafe"
     try:
-        words = sys.argv[1:] if argv is None else argv
-        words = words if words[:1] == ["ros2"] else without_names(words)
-        words = without_remappings(words) if words[:1] and words[0] in _LAUNCHED else words
+        words = _without_ros1(sys.argv[1:] if argv is None else argv)
         options, rest = _parser(words).parse_known_args(words)
         name = f"rosafe {options.command}"
         if hasattr(options, "missing"):
@@ -62,6 +60,14 @@ def main(argv: list[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         return 130
+
+
+def _without_ros1(words: list[str]) -> list[str]:
+    """Return a command line without arguments that roslaunch adds; those of ROS 2 have the same form."""
+    if words[:1] == ["ros2"]:
+        return words
+    words = without_names(words)
+    return without_remappings(words) if words[:1] and words[0] in _LAUNCHED else words
 
 
 def _parser(words: list[str]) -> argparse.ArgumentParser:

@@ -64,4 +64,4 @@ def test_directions_in_rooms(kemar, kemar_model):
         sound = scipy.signal.oaconvolve(modulated(1.5, number)[np.newaxis], response, axes=-1)[:, : 3 * RATE // 2]
         found = localize(sound, RATE, kemar_model, 1.0)
         right.append(abs(found["azimuth"][-1] - azimuth) <= 5)
-    assert np.mean(right) >= 0.8
+    assert np.mean(right) >= 0.7

@@ -92,7 +92,7 @@ _NAME = r"(?<![\w./:<>{}$*-])[\w+-]+(?:/[\w+-]+)*\."
 _PATH = re.compile(rf"{_NAME}(?:py|md|c|h|js|css|html|sh|tcl|m|rst|ipynb)\b(?![\w/*]|\.\w)")
 _MODULE = re.compile(r"(?<![\w./:-])rosafe(?:\.[a-z]\w+)+(?:\.[A-Z_]\w+)*(?![\w/-])")
 FOLDERS = {path.name for root in (ROOT, PACKAGE, ROOT / "tests") for path in root.iterdir() if path.is_dir()}
-_UNITS = {"rosafe.launch", "rosafe.target", "rosafe.service"}  # files of roslaunch and systemd
+_UNITS = {"rosafe.launch", "rosafe.launch.py", "rosafe.target", "rosafe.service"}  # files of roslaunch and systemd
 
 
 def referring(*suffixes: str) -> list[Path]:
@@ -127,7 +127,7 @@ def resolves(name: str) -> bool:
         try:
             value: object = importlib.import_module(".".join(parts[:end]))
         except ModuleNotFoundError as problem:
-            if problem.name == "torch":  # which only `rosafe.torch` needs
+            if problem.name in ("torch", "rclpy"):  # which only `rosafe.torch` and `rosafe.ros2` need
                 return True
             continue
         for attribute in parts[end:]:

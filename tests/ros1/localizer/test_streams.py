@@ -22,7 +22,7 @@ from rosafe.localization.head import Head
 from rosafe.ros1.localizer.publishers import source_markers
 from rosafe.ros1.localizer.sound import InputSound
 from rosafe.ros1.transport.paths import PYPI_DIR
-from tests.harness import PYTHON, ROOT, Graph, wait_for
+from tests.harness import PYTHON, ROOT, Graph, Process, wait_for
 from tests.localization.sounds import music
 from tests.localization.test_enhancement import RECORDINGS, si_sdr
 from tests.ros1.localizer.conftest import RATE
@@ -102,7 +102,7 @@ def test_streams_are_those_of_the_file(
         assert np.nanmax(speech[by_azimuth[3]]) > 0.8 > 0.5 > np.nanmedian(speech[by_azimuth[-4]])
 
 
-def test_sound_of_another_rate_is_not_read_and_frames_count_from_0(graph: Graph, tmp_path: Path) -> None:
+def test_sound_of_another_rate_is_not_read_and_frames_count_from_0(graph: Graph, bass: Process, tmp_path: Path) -> None:
     path = tmp_path / "numbers.wav"
     numbers = np.arange(3 * RATE) / 2.0**20  # of the samples, from 0
     soundfile.write(path, np.stack((numbers, numbers), axis=1), RATE, subtype="PCM_32")
@@ -110,7 +110,6 @@ def test_sound_of_another_rate_is_not_read_and_frames_count_from_0(graph: Graph,
     clock: Any = SimpleNamespace(time=lambda frame: moment)
     graph.client()
     with (
-        graph.node("bass-ros"),
         contextlib.closing(InputSound("/bass/Audio", float(RATE), clock, cast(Any, None))) as sound,
         contextlib.closing(InputSound("/bass/Audio", 2.0 * RATE, clock, cast(Any, None))) as other,
     ):
