@@ -24,7 +24,7 @@ def _named(struct: Struct) -> Struct:
     return tuple((re.sub("(?<=[a-z])(?=[A-Z])", "_", name).lower(), idl) for name, idl in struct)
 
 
-_SHARED: dict[str, Struct] = {  # the messages of ROS 1, and what only ROS 2 has of the sources
+_SHARED: dict[str, Struct] = {  # messages of ROS 1, and those fields and messages that ROS 1 may not have yet
     "SourceAudio": (
         ("header", "::Header"),
         ("id", "unsigned long"),
@@ -77,7 +77,7 @@ _REMARKS = {  # by field; `Message.field` if the same name has several meanings
     "output": "part of the output, such as left",
     "axes": "one name for each dimension; the last one is time",
     "shape": "data is row-major, time last",
-    "coordinates": "of the axes that have them, such as the frequencies of channels",
+    "coordinates": "such as the frequencies of channels, for axes with such numbers",
     "frame_rate": "Hz",
     "first_frame": "absolute number of the first frame",
     "lost_frames": "missing between the previous message and this one",
@@ -98,7 +98,7 @@ _REMARKS = {  # by field; `Message.field` if the same name has several meanings
     "setup": "text of a setup file (YAML)",
     "device": "such as plughw:1,0, file:take.wav or scene:",
     "sample_rate": "Hz",
-    "Acquire.sample_rate": "Hz; 0: that of the source with file: and bag:, otherwise 44100",
+    "Acquire.sample_rate": "Hz; 0 selects the rate of a file or bag, otherwise 44100",
     "RequestRepresentation.name": "of its processor; empty: chosen by the node",
     "RequestRepresentation.processors": "from the input to the representation",
     "message": "reason of a failure",

@@ -113,7 +113,13 @@ class RosafeNode:
         self._pending: list[Callable[[], object]] = []  # to do with the first sound
         self._localizer: Mapping[str, Any] | None = None  # its settings
         self._localization: Localization | None = None
-        self._status = NodeStatus(lambda: None, {OK: log.info, WARN: log.warning, ERROR: log.error})
+        # each with a line of its own: rclpy accepts one severity for each line that logs
+        severities = {
+            OK: lambda text: log.info(text),
+            WARN: lambda text: log.warning(text),
+            ERROR: lambda text: log.error(text),
+        }
+        self._status = NodeStatus(lambda: None, severities)
         self._keep = self._kept()
         self._serve()
         self._diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))

@@ -12,7 +12,7 @@ import pytest
 import soundfile
 
 from tests.harness import PYTHON, ROOT, Process, freeze, wait_for
-from tests.localization.conftest import sphere_model
+from tests.localization.conftest import modulated, sphere_model
 
 from .network import Network
 
@@ -20,7 +20,7 @@ __all__ = ["sphere_model"]
 
 RATE = 16000
 AZIMUTH = 40.0
-SCENE = f"sample_rate: {RATE}\nsources:\n- {{name: left, signal: noise, azimuth: {AZIMUTH}}}\n"
+SCENE = f"sample_rate: {RATE}\nsources:\n- {{name: left, file: left.wav, loop: true, azimuth: {AZIMUTH}}}\n"
 # With the same numpy as the node: others may round sines differently
 PROCESS = """
 import sys, numpy, rosafe, soundfile
@@ -43,6 +43,13 @@ while time.monotonic() < end:
             sent += 1
 print(sent, flush=True)
 """
+
+
+def scene(folder: Path) -> Path:
+    """Write a scene with one source, whose level changes as in speech."""
+    soundfile.write(folder / "left.wav", modulated(10.0, 1), RATE)
+    (folder / "scene.yaml").write_text(SCENE)
+    return folder / "scene.yaml"
 
 
 def dds(ros2: Network, *arguments: str) -> Process:
@@ -71,7 +78,7 @@ def ready(client: Process) -> Process:
 
 def ild_of(ros2: Network, **env: str) -> Process:
     """Start a node that computes the ILD of a scene with few channels."""
-    return ros2.node("device:='scene:'", "representations:=[ild]", f"frames_per_block:={RATE // 100}", **env)
+    return ros2.node("device:=scene:", "representations:=[ild]", f"frames_per_block:={RATE // 100}", **env)
 
 
 def test_values_and_services(ros2: Network, tmp_path: Path) -> None:
@@ -108,9 +115,8 @@ def test_values_and_services(ros2: Network, tmp_path: Path) -> None:
 
 
 def test_sources(ros2: Network, tmp_path: Path, sphere_model: Path) -> None:
-    (tmp_path / "scene.yaml").write_text(SCENE)
     client = dds(ros2, "listen", "/rosafe/sources", "SoundSources")
-    ros2.node(f"device:='scene:{tmp_path}/scene.yaml'", f"head:='{sphere_model}'")
+    ros2.node(f"device:=scene:{scene(tmp_path)}", f"head:={sphere_model}")
 
     def present() -> list[dict[str, Any]]:
         return [source for message in lines(client) for source in message["sources"] if source["probability"] > 0.9]

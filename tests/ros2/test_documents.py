@@ -12,7 +12,7 @@ from tests.harness import ROOT, wait_for
 from tests.localization.conftest import sphere_model
 
 from .network import Network
-from .test_dds import AZIMUTH, SCENE
+from .test_dds import AZIMUTH, scene
 
 __all__ = ["sphere_model"]
 
@@ -22,8 +22,7 @@ PROGRAMS = re.findall("```python\n(.*?)```", PAGE, re.DOTALL)
 
 @pytest.mark.parametrize("number", [0, 2], ids=["rclpy", "cyclonedds"])
 def test_programs_that_print_sources(ros2: Network, tmp_path: Path, sphere_model: Path, number: int) -> None:
-    (tmp_path / "scene.yaml").write_text(SCENE)
-    ros2.node(f"device:=scene:{tmp_path}/scene.yaml", "localize:=true", f"head:={sphere_model}")
+    ros2.node(f"device:=scene:{scene(tmp_path)}", "localize:=true", f"head:={sphere_model}")
     program = ros2.python(PROGRAMS[number])
     wait_for(lambda: len(program.out.splitlines()) > 8, what=lambda: f"{program}: {program.out}{program.err}")
     source, azimuth, level = map(int, program.out.splitlines()[-2].split())
@@ -32,7 +31,7 @@ def test_programs_that_print_sources(ros2: Network, tmp_path: Path, sphere_model
 
 
 def test_the_program_that_prints_shapes(ros2: Network) -> None:
-    ros2.node("device:=scene:", "representations:='[ild, ratemap]'".replace("'", ""))
+    ros2.node("device:=scene:", "representations:=[ild, ratemap]")
     program = ros2.python(PROGRAMS[1])
     wait_for(lambda: len(program.out.splitlines()) > 3, what=lambda: f"{program}: {program.out}{program.err}")
     assert re.fullmatch(r"\d+ \(31, \d\) 31 0", program.out.splitlines()[2]) and not program.err

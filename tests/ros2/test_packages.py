@@ -29,9 +29,9 @@ def run(env: dict[str, str], *command: str | Path, cwd: Path) -> str:
     return done.stdout
 
 
-def build(env: dict[str, str], folder: Path, *options: str) -> Path:
+def build(env: dict[str, str], folder: Path, packages: Path, *options: str) -> Path:
     """Build packages in a workspace, and return its folder of installed files."""
-    out = run(env | {"HOME": str(folder)}, "colcon", "build", "--base-paths", PACKAGES, *options, cwd=folder)
+    out = run(env | {"HOME": str(folder)}, "colcon", "build", "--base-paths", packages, *options, cwd=folder)
     assert "failed" not in out
     return folder / "install"
 
@@ -44,7 +44,7 @@ def sourced(env: dict[str, str], install: Path) -> dict[str, str]:
 
 def test_the_node_of_a_workspace(ros2: Network, tmp_path: Path) -> None:
     """Built without links, it runs without the checkout; its files are those of the checkout."""
-    install = build(ros2.env, tmp_path, "--packages-select", "rosafe_ros2")
+    install = build(ros2.env, tmp_path, OWN)
     prefix = install / "rosafe_ros2"
     assert (prefix / "share/ament_index/resource_index/packages/rosafe_ros2").is_file()
     assert (prefix / "share/rosafe_ros2/launch/rosafe.launch.py").read_bytes() == LAUNCH.read_bytes()
@@ -66,7 +66,7 @@ def test_both_packages_in_an_empty_workspace(ros2_env: dict[str, str], tmp_path:
         name: ":".join(entry for entry in value.split(":") if "/packages/rosafe_msgs-" not in entry)
         for name, value in ros2_env.items()
     }
-    install = build(env, tmp_path, "--symlink-install")
+    install = build(env, tmp_path, PACKAGES, "--symlink-install")
     show = "import rosafe.ros2.node as node, rosafe_msgs.msg as msg; print(node.__file__, msg.__file__)"
     node, messages = run(sourced(env, install), "/usr/bin/python3", "-c", show, cwd=tmp_path).split()
     assert Path(node).resolve() == ROOT / "rosafe" / "ros2" / "node.py"
