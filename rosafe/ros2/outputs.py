@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, Protocol
@@ -11,7 +10,6 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rosafe_msgs.msg import Coordinate, Representation
 
-from rosafe.audio.files.windows import EXACT
 from rosafe.interface import KINDS, ROSAFE
 from rosafe.results.view.coordinates import axis_coordinates
 from rosafe.ros2.messages import numbers, ros_time
@@ -64,17 +62,17 @@ class FrameCounter:
         before = self._next
         restarted = reader is not self._reader or signal != self._signal or gap < 0
         if restarted:
-            on_grid = max(0, math.floor((end - signal.window) / signal.hop + EXACT) + 1)
-            self._origin = end - reader.block, max(0, on_grid - frames)
+            begin = end - reader.block
+            self._origin = begin, round(begin / signal.hop)
             self._frames = self._missing = gap = 0
             self._reader, self._signal = reader, signal
         self._missing += gap
         self._end = end
         first = self._origin[1] + self._frames + round(self._missing / signal.hop)
-        begin = self._origin[0] + self._missing + self._frames * signal.hop
+        position = self._origin[0] + self._missing + self._frames * signal.hop
         self._frames += frames
         self._next = first + frames
-        return FramePosition(first, 0 if restarted else first - before, begin, restarted)
+        return FramePosition(first, 0 if restarted else first - before, position, restarted)
 
 
 class FrameConsumer(Protocol):
