@@ -81,7 +81,8 @@ def _parser(words: list[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"rosafe {VERSION}")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
-    names = [module.name for module in pkgutil.iter_modules(commands.__path__) if not module.name.startswith("_")]
+    modules = [module for module in pkgutil.iter_modules(commands.__path__) if not module.ispkg]
+    names = [module.name for module in modules if not module.name.startswith("_")]
     chosen = words[0].replace("-", "_") if words else ""
     if chosen in names:
         if chosen in _WITHOUT_PLUGINS:
