@@ -28,7 +28,7 @@ MAX_CHANNELS = 128  # of a model
 CLASSES = COHERENCE_CLASSES * LEVEL_CLASSES
 FLOOR_QUANTILE = 0.02  # of the levels in a window: the floor
 MAX_VALUE = 1e100  # of a feature: sums of larger ones overflow
-MIN_LEVEL = -130.0  # dB, of the ratemap of a sound with full scale 1; channels below have no cues
+MIN_LEVEL = -150.0  # dB, of the ratemap of a sound with full scale 1; channels below have no cues
 RANGE_DB = 60.0  # a channel that is weaker than the strongest one by more contains only its skirt: no cues
 
 
