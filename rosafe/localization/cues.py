@@ -82,7 +82,7 @@ def max_itd(spacing: float | None) -> float:
     return MAX_ITD if spacing is None else 1.25 * spacing / SPEED_OF_SOUND + 1e-4
 
 
-def quantize(features: Mapping[str, Any], gain_db: float, max_itd: float = MAX_ITD) -> Cues:
+def quantize(features: Mapping[str, Any], gain_db: float, max_itd: float) -> Cues:
     """Quantize the representations `itd`, `ild`, `ic` (C, F) and `ratemap` (2, C, F); see `scaling_db`, `max_itd`."""
     itd, ild, coherence, ratemap = (np.asarray(features[kind], np.float64) for kind in KINDS)
     minimum = MIN_LEVEL + gain_db

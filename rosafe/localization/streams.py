@@ -112,13 +112,16 @@ class SourceStreams:
         grid = FrameGrid.design(RATE, "cc", values)
         self._hop, self._half = grid.hop, len(grid.window) // 2
         self._resampler = Resampler(model.sample_rate, RATE, UNIT)
-        self._stream = Stream(RATE, values, ["gammatone", *cues.KINDS])
+        self._cues = Stream(RATE, values, cues.KINDS)
+        # The high-pass is for the cues only.
+        self._filterbank = Stream(RATE, {**values, "pp_bRemoveDC": False}, ["gammatone"])
         self.reset()
 
     def reset(self) -> None:
         """Forget all sound and all tracks."""
         self._resampler.reset()
-        self._stream.reset()
+        self._cues.reset()
+        self._filterbank.reset()
         self._masks.reset()
         self._first = -max(0, self._hop - self._half)  # sample with which the channels begin: after the last frame
         self._channels = np.zeros((2, self._masks.channels, -self._first))
@@ -186,8 +189,8 @@ class SourceStreams:
         return [part for unit in self._resampler.process(samples) for part in self._process_unit(unit)]
 
     def _process_unit(self, unit: FloatArray) -> list[SourcePart]:
-        features = self._stream.process(unit)
-        channels = np.concatenate((self._channels, features["gammatone"]), axis=2)
+        features = self._cues.process(unit)
+        channels = np.concatenate((self._channels, self._filterbank.process(unit)["gammatone"]), axis=2)
         begin = self._frames * self._hop + self._half - self._hop
         skipped = min(max(0, begin - self._first), channels.shape[2])
         count = features["itd"].shape[1]
@@ -280,7 +283,7 @@ class _Masks:
         self, features: Mapping[str, FloatArray], azimuths: Sequence[Mapping[int, float]]
     ) -> list[dict[int, FloatArray]]:
         """Return, for each new frame, the masks (C,) of the sources whose azimuths relative to the head are given."""
-        found = cues.quantize(features, cues.scaling_db(self._model.parameters))
+        found = cues.quantize(features, cues.scaling_db(self._model.parameters), self._model.max_itd)
         levels = np.concatenate((self._levels, found.level))
         self._levels = levels[1 - WINDOW :]
         first = len(levels) - len(found.level) + 1

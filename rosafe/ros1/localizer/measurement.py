@@ -121,7 +121,7 @@ class FrameListener:
 
 def levels_of(model: DirectionModel, frames: NewFrames) -> FloatArray:
     """Return the level (F, C) of frames of both ears in dB, as in `rosafe.localization.cues`."""
-    return cues.quantize(frames.features, cues.scaling_db(model.parameters)).level
+    return cues.quantize(frames.features, cues.scaling_db(model.parameters), model.max_itd).level
 
 
 def ear_levels(model: DirectionModel, frames: NewFrames) -> FloatArray:
