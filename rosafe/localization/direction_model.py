@@ -43,7 +43,7 @@ from rosafe.results.result_metadata import MAX_TEXT, from_json
 from rosafe.system.output import new_file
 from rosafe.system.terminal import printable
 
-FORMAT = "rosafe direction model 1"
+FORMAT = "rosafe direction model 2"
 WINDOW = 100  # frames for which a floor is estimated while learning
 _SMOOTHING = 0.75  # bins, along ITD and ILD
 _CLASS_SMOOTHING = 0.5  # classes
@@ -95,7 +95,7 @@ class DirectionModel:
         self.parameters = dict(description["parameters"])
         self.head = str(description["head"])
         self.is_sphere = bool(description["is_sphere"])
-        self.max_itd = float(description.get("max_itd", cues.MAX_ITD))
+        self.max_itd = float(description["max_itd"])
         self.level_gain_db = float(description["level_gain_db"])
         # Half precision, as in files, so that a learned and a loaded model give the same numbers.
         self.itd_table = np.asarray(itd_table, np.float16).astype(np.float32, order="C")
@@ -123,8 +123,13 @@ class DirectionModel:
         return itd_row, ild_row
 
     def terms(self, itd_row: NDArray[np.intp], ild_row: NDArray[np.intp]) -> NDArray[np.float32]:
-        """Return log-likelihood ratios (F, C, A) for the rows (F, C) of `rows`."""
+        """Return weighted log-likelihood ratios (F, C, A) for the rows (F, C) of `rows`."""
         return self.itd_table[itd_row] + self.ild_table[ild_row]
+
+    def unweighted_terms(self, itd_row: NDArray[np.intp], ild_row: NDArray[np.intp]) -> NDArray[np.float32]:
+        """Return `terms` without the weights, which are for sums over frames and channels: those of each unit alone."""
+        itd, ild = _weights(self.parameters["fb_cfHz"])
+        return _unweighted(self.itd_table, itd_row, itd, ITD_BINS) + _unweighted(self.ild_table, ild_row, ild, ILD_BINS)
 
     def add_evidence(
         self,
@@ -213,7 +218,6 @@ def _checked_description(found: Any) -> dict[str, Any]:
     """Return the description in a file with the number of `channels`; ValueError unless learning could write it."""
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise ValueError(f"expected the format {FORMAT!r}")
-    found.setdefault("max_itd", cues.MAX_ITD)
     for key, fits in _DESCRIPTION.items():
         if key not in found or not fits(found[key]):
             raise ValueError(f"{key}: expected another value, got {short_repr(found.get(key))}")
@@ -300,6 +304,14 @@ def _weights(frequencies: FloatArray) -> FloatArray:
     places = erb_rate(np.asarray(frequencies)), erb_rate(_WEIGHT_HZ)
     cues_of = [[np.exp(np.interp(*places, np.log(one))) for one in cue] for cue in _WEIGHTS]  # (2, 2, C)
     return np.repeat(np.moveaxis(np.array(cues_of), 1, 2), (_COHERENT, COHERENCE_CLASSES - _COHERENT), axis=2)
+
+
+def _unweighted(
+    table: NDArray[np.float32], row: NDArray[np.intp], weights: FloatArray, bins: int
+) -> NDArray[np.float32]:
+    """Return the rows of a table divided by the `weights` (C, K) that they were multiplied by; the last row is zero."""
+    of_row = np.append(weights.ravel(), 1.0)[row // (LEVEL_CLASSES * bins)]
+    return np.asarray(table[row] / of_row[..., np.newaxis].astype(np.float32))
 
 
 def _log_ratios(counts: np.ndarray, hum: np.ndarray, weights: FloatArray) -> np.ndarray:

@@ -166,7 +166,7 @@ class _Enhancer:
 
     def _probability(self, model: DirectionModel, found: cues.Cues, around: FloatArray) -> FloatArray:
         """Return the probability (F, C) that a frame of a channel comes from the target."""
-        terms = model.terms(*model.rows(found, cues.floors(around)))
+        terms = model.unweighted_terms(*model.rows(found, cues.floors(around)))
         likelihood = np.exp(SHARPNESS * (terms - terms.max(axis=-1, keepdims=True)), dtype=np.float64)
         near, far = self._distance <= WIDTH + 1e-9, self._distance > WIDTH + GAP
         wanted = likelihood[..., near if near.any() else self._distance == self._distance.min()].mean(axis=-1)

@@ -296,7 +296,7 @@ class _Masks:
             rows = self._model.rows(
                 found.select(slice(number, number + 1)), cues.floors(levels[max(0, end - WINDOW) : end])
             )
-            terms = self._model.terms(*rows)[0]
+            terms = self._model.unweighted_terms(*rows)[0]
             likelihood = np.exp(SHARPNESS * (terms - terms.max(axis=-1, keepdims=True)), dtype=np.float64)
             computed = self._of_frame(likelihood, np.array(list(sources.values())))
             masks.append(dict(zip(sources, computed, strict=True)))
