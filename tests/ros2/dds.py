@@ -120,5 +120,6 @@ def call(service: str, kind: str, fields: str) -> None:
 
 if __name__ == "__main__":
     os.environ["CYCLONEDDS_URI"] = LOOPBACK
-    {"listen": listen, "idle": idle, "call": call}[sys.argv[1]](*sys.argv[2:])
+    commands: dict[str, Callable[..., None]] = {"listen": listen, "idle": idle, "call": call}
+    commands[sys.argv[1]](*sys.argv[2:])
     assert "rclpy" not in sys.modules

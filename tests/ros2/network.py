@@ -53,9 +53,9 @@ class Network:
         ]
         self._processes: list[Process] = []
 
-    def start(self, *command: str | Path, cwd: Path | None = None, **env: str) -> Process:
+    def start(self, *command: str | Path, **env: str) -> Process:
         """Start a program, which ends with the test at the latest."""
-        process = Process([*self._enter, *map(str, command)], self.env | env, cwd, fork=False)
+        process = Process([*self._enter, *map(str, command)], self.env | env, fork=False)
         self._processes.append(process)
         return process
 

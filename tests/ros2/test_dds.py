@@ -76,9 +76,11 @@ def ready(client: Process) -> Process:
     return client
 
 
-def ild_of(ros2: Network, **env: str) -> Process:
+def ild_of(ros2: Network, domain: int = 0) -> Process:
     """Start a node that computes the ILD of a scene with few channels."""
-    return ros2.node("device:=scene:", "representations:=[ild]", f"frames_per_block:={RATE // 100}", **env)
+    return ros2.node(
+        "device:=scene:", "representations:=[ild]", f"frames_per_block:={RATE // 100}", ROS_DOMAIN_ID=str(domain)
+    )
 
 
 def test_values_and_services(ros2: Network, tmp_path: Path) -> None:
@@ -128,7 +130,7 @@ def test_sources(ros2: Network, tmp_path: Path, sphere_model: Path) -> None:
 
 
 def test_domains(ros2: Network) -> None:
-    ild_of(ros2, ROS_DOMAIN_ID="5")
+    ild_of(ros2, domain=5)
     same, other = (ready(dds(ros2, "listen", "/rosafe/ild", "Representation", domain)) for domain in "50")
     wait_for(lambda: len(lines(same)) > 20)
     assert not lines(other)
