@@ -26,8 +26,8 @@ STARTING_FILES = (  # the same for single files
     "ros1/bass/test_calibration.py",
     "audio/test_hostile_files.py",
     "ros1/bass/test_record.py",
-    "eltclsh/test_script.py",
-    "eltclsh/test_terminal.py",
+    "commands/eltclsh/test_script.py",
+    "commands/eltclsh/test_terminal.py",
     "web/genomix/test_packed.py",
     "ros1/localizer/test_recovery.py",
     "results/test_damaged.py",
@@ -53,8 +53,8 @@ LONG_FILES = (  # dozens of seconds of computation; scripts/test --fast has othe
     "ros1/localizer/test_long_silence.py",
     "processing/test_stream.py",
     "validation/test_validate.py",
-    "view/test_figure.py",
-    "view/test_plot.py",
+    "results/view/test_figure.py",
+    "results/view/test_plot.py",
 )
 LONGEST_FILES = (  # they begin first, so that no process works on one of them while the others have nothing to do
     "packaging/test_lint.py",
@@ -92,10 +92,10 @@ EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal s
     "packaging/test_catkin.py::test_executables": 2,
     "plugins/test_documents.py::test_examples": 2,
     "plugins/test_versions.py::test_a_client_with_another_plugin": 2,
-    "setups/test_parsing_time.py::test_time_is_bounded": 4,
-    "setups/test_parsing_time.py::test_time_is_linear": 5,
+    "tree/setups/test_parsing_time.py::test_time_is_bounded": 4,
+    "tree/setups/test_parsing_time.py::test_time_is_linear": 5,
     "tree/test_schedules.py::test_any_order_of_events": 2,
-    "view/test_plot.py::test_silent_and_very_short_signals": 3,
+    "results/view/test_plot.py::test_silent_and_very_short_signals": 3,
 }
 ELSEWHERE = ("aarch64", "nehalem", "clang")  # kernels under qemu, or built by another compiler
 
