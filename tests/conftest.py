@@ -19,7 +19,7 @@ from tests.audio.pulseaudio import PulseServer
 from tests.dsp.implementations import NUMPY, Choice, levels
 
 # Folders whose tests start commands, browsers, compilers
-STARTING = ("commands", "demo", "web/live", "packaging", "ros2", "setups")
+STARTING = ("commands", "demo", "web/live", "packaging", "ros2", "tree/setups")
 # Folders whose tests start programs as users do, not as forks
 OF_THE_START = ("demo", "packaging", "soak", "ros1/startup")
 STARTING_FILES = (  # the same for single files
@@ -79,7 +79,6 @@ NO_KERNELS = (  # tests of stages that have no kernel: the same code runs with k
 EACH_VARIANT = 4  # of the cases of a test, each fourth is repeated with numpy, or with kernels of an older processor
 EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal suite; all with scripts/test --long
     "commands/test_corpus.py::test_names_that_are_not_utf8": 2,
-    "commands/test_writers.py::test_many_concurrent_writers": 2,
     "dsp/test_kernels.py::test_autocorrelation": 4,
     "dsp/test_processors.py::test_every_kernel": 3,
     "web/genomix/test_guide.py::test_usage_patterns_of_published_scripts": 2,
