@@ -67,10 +67,7 @@ class Source(Protocol):
     """
 
     sample_rate: float
-
-    @property
-    def ended(self) -> bool:
-        """See the class."""
+    ended: bool
 
     @property
     def waiting(self) -> bool:

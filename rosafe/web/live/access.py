@@ -6,7 +6,8 @@ import hmac
 import secrets
 from collections.abc import Collection, Mapping
 
-from rosafe.web.server.access import HttpRefusal, check_host, check_same_origin, host_name
+from rosafe.web.server.access import check_host, check_same_origin, host_name
+from rosafe.web.server.refusal import HttpRefusal
 
 HEADERS = {
     "Content-Security-Policy": (

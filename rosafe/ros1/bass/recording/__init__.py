@@ -1,0 +1,1 @@
+"""Recording: sound from any source into WAV files and bags, with its levels."""

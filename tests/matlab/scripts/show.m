@@ -1,3 +1,0 @@
-function show(name, value)
-  printf('%s=%s\n', name, jsonencode(value));
-end
