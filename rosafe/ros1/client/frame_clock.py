@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import threading
 import time
 from collections import deque
 from typing import Any, NamedTuple
+
+from rosafe.declarations.checks import is_number
+from rosafe.declarations.text import short_repr
 
 MAX_LINES = 600  # lines of a FrameClock: at least two minutes with the default block
 MAX_RATE = 1_000_000.0  # Hz
@@ -74,9 +78,10 @@ class FrameClock:
         self._subscriber.unregister()
 
     def wait(self, timeout: float = 5.0) -> bool:
-        """Wait up to `timeout` s until times are known. Return whether they are."""
+        """Wait up to `timeout` s until times are known. Return whether they are. ValueError if it is not a number."""
+        seconds = min(checked_timeout(timeout), threading.TIMEOUT_MAX)
         with self._arrived:
-            return self._arrived.wait_for(lambda: bool(self._lines), timeout)
+            return self._arrived.wait_for(lambda: bool(self._lines), seconds)
 
     def covers(self, frame: int, within: float) -> bool:
         """Return whether the time of an audio frame less than `within` frames from `frame` has arrived last."""
@@ -162,6 +167,15 @@ class FrameClock:
             self._lines.append(line)
             self._arrived.notify_all()
         return ""
+
+
+def checked_timeout(timeout: float | None) -> float:
+    """Return a timeout in s; None and infinity are infinity. Raises ValueError for anything else."""
+    if timeout is None or (isinstance(timeout, float) and timeout == math.inf):
+        return math.inf
+    if not is_number(timeout):
+        raise ValueError(f"timeout: expected seconds or None, got {short_repr(timeout)}")
+    return float(timeout)
 
 
 def _read_line(message: Any, data: bytes) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import math
 import threading
 import time
 from collections import deque
@@ -17,7 +16,7 @@ import numpy as np
 from rosafe.audio.files.windows import MAX_INDEX, MAX_WINDOW, WindowStream, mismatch, rows_of, window_error
 from rosafe.declarations.text import short_repr
 from rosafe.interface import BASS, KINDS, LAYOUTS
-from rosafe.ros1.client.frame_clock import FrameClock
+from rosafe.ros1.client.frame_clock import FrameClock, checked_timeout
 from rosafe.ros1.client.tree_snapshot import TreeSnapshot
 from rosafe.system.terminal import printable
 
@@ -318,7 +317,7 @@ class PortReader(PortSubscription):
     """
 
     def __init__(self, topic: str, callback: Callable[[Frames], None] | None = None, queue_size: int = 100) -> None:
-        if not isinstance(queue_size, (int, np.integer)) or queue_size < 1:
+        if isinstance(queue_size, bool) or not isinstance(queue_size, (int, np.integer)) or queue_size < 1:
             raise ValueError(f"queue_size: expected a whole number from 1 on, got {short_repr(queue_size)}")
         self._arrived = threading.Condition()
         self._waiting: deque[Frames] = deque()
@@ -339,9 +338,7 @@ class PortReader(PortSubscription):
         """
         import rospy
 
-        if timeout is not None and not (isinstance(timeout, (int, float, np.number)) and timeout == timeout):
-            raise ValueError(f"timeout: expected seconds or None, got {short_repr(timeout)}")
-        end = math.inf if timeout is None else time.monotonic() + timeout
+        end = time.monotonic() + checked_timeout(timeout)
         with self._arrived:
             while not self._waiting:
                 rest = end - time.monotonic()

@@ -152,8 +152,12 @@ def test_a_time_is_published_with_each_block(afe: Session, stamped: Stamped) -> 
 
 
 def test_a_client_computes_the_time_of_a_frame_of_any_port(afe: Session, stamped: Stamped) -> None:
-    with contextlib.closing(FrameClock("/absent")) as clock, pytest.raises(LookupError, match="/absent/frameTime"):
-        clock.time(3)
+    with contextlib.closing(FrameClock("/absent")) as clock:
+        with pytest.raises(LookupError, match="/absent/frameTime"):
+            clock.time(3)
+        with pytest.raises(ValueError, match="timeout: expected seconds or None, got nan"):
+            clock.wait(float("nan"))
+        assert not clock.wait(0.0)
     clock = FrameClock()
     afe.build("PreProc", "GammatoneProc", "IhcProc", "IldProc", block=1600)  # hop of 200 frames, window of 400
     stamped.play(noise(8000))

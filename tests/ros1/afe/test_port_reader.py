@@ -212,14 +212,14 @@ def test_another_topic_is_rejected(afe: Session) -> None:
         PortReader("/rosout")
 
 
-@pytest.mark.parametrize("size", [0, -1, 1.5, None, "3"])
+@pytest.mark.parametrize("size", [0, -1, 1.5, True, None, "3"])
 def test_a_queue_without_room_is_rejected(size: Any) -> None:
     with pytest.raises(ValueError, match="queue_size: expected a whole number from 1 on, got "):
         PortReader(TOPICS["ild"], queue_size=size)
 
 
 def test_a_timeout_is_a_number(ild: PortReader) -> None:
-    for timeout in (float("nan"), "1"):
+    for timeout in (float("nan"), "1", True, 10**400, -float("inf")):
         with pytest.raises(ValueError, match="timeout: expected seconds or None, got "):
             ild.read(timeout)  # type: ignore[arg-type]
     with pytest.raises(TimeoutError):
