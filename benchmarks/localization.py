@@ -1,24 +1,29 @@
-"""Accuracy of `rosafe.localize`: one and two sources, a turning head, another head, a room; cost and latency.
+"""Accuracy of `rosafe.localize`: one and two sources, a turning head, other heads, rooms; cost and latency.
 
-Needs Debian's libmysofa1 (the MIT KEMAR head), espeak-ng and alsa-utils (speech). The room needs pyroomacoustics and is
-left out without it. Writes benchmarks/results/localization.md. Training uses synthetic sounds only.
+Needs Debian's libmysofa1 (the MIT KEMAR head), espeak-ng and alsa-utils (speech). Writes
+benchmarks/results/localization.md. Training uses synthetic sounds only, and none of these rooms.
 
-    /usr/bin/python3 -m benchmarks.localization [SECTION ...]
+    /usr/bin/python3 -m benchmarks.localization [SECTION ...] [--every N] [--rate HZ]
+
+`--every N` uses each Nth direction only, and `--rate` another sample rate; then nothing is written. Two minutes on two
+quiet cores: `rooms --every 6 --rate 16000`.
 """
 
 from __future__ import annotations
 
+import argparse
+import itertools
 import os
 import re
 import subprocess
-import sys
 import time
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.signal
@@ -26,14 +31,19 @@ import soundfile
 
 import rosafe
 from rosafe.localization import angles
+from rosafe.localization.filters import HOP, SourceRenderer
+from rosafe.localization.rectangular_room import RectangularRoom, RoomReflections
+from rosafe.localization.reverberation import Reverberation
 from rosafe.localization.scene import BLOCK, DiffuseNoise
 
-RATE = 44100
+RATE = 44100  # Hz; `main` may set another one
+EVERY = 1  # direction is used; `main` may set a larger number
 KEMAR = "/usr/share/libmysofa/MIT_KEMAR_normal_pinna.sofa"
 RESULT = Path(__file__).parent / "results" / "localization.md"
 SNRS = (60, 20, 10, 5, 0, -5)
 DIRECTIONS = angles.grid()
 SECONDS = 5  # of speech for each direction
+ROOM_SECONDS = 3.0  # of speech for each direction in a room
 TURNS = 3  # seconds of speech for each direction with a turning head
 LEVEL = 10 ** (-35 / 20)
 VOICES = {
@@ -44,8 +54,26 @@ VOICES = {
     "it+m2": "La strada lunga porta alla montagna. Domani mattina il treno parte molto presto dalla stazione.",
 }
 RECORDINGS = Path("/usr/share/sounds/alsa")
+SURREY = Path(__file__).parents[2] / "shared" / "rooms" / "UniS_Anechoic_BRIR_16k.sofa"
 RATIOS = (5.0, 0.0, -5.0)  # dB, direct to reverberant
-ROOM, REVERBERATION, DISTANCE = (6.0, 5.0, 3.0), 0.4, 1.5  # m, s, m
+
+
+class Place(NamedTuple):
+    """A room with the head in it, the direction of the head (degrees), and the distance of the sources (m)."""
+
+    room: RectangularRoom
+    yaw: float
+    distance: float
+
+
+PLACES = (
+    Place(RectangularRoom((3.0, 3.0, 2.5), 0.2, (1.3, 1.6, 1.2)), 20.0, 0.7),
+    Place(RectangularRoom((4.0, 3.0, 2.5), 0.3, (1.8, 1.3, 1.4)), -35.0, 1.0),
+    Place(RectangularRoom((5.0, 4.0, 2.7), 0.5, (2.8, 1.7, 1.2)), 70.0, 1.2),
+    Place(RectangularRoom((6.0, 5.0, 3.0), 0.4, (2.7, 2.2, 1.6)), 0.0, 1.5),
+    Place(RectangularRoom((8.0, 6.0, 3.0), 0.6, (3.4, 3.3, 1.5)), 130.0, 2.0),
+    Place(RectangularRoom((10.0, 8.0, 3.5), 0.8, (4.6, 3.6, 1.7)), -100.0, 3.0),
+)
 
 # --- sounds -----------------------------------------------------------------------------------------------------
 
@@ -58,19 +86,20 @@ def head() -> rosafe.Head:
 
 @lru_cache(maxsize=1)
 def talkers() -> list[np.ndarray]:
-    """Return speech of several voices at 44.1 kHz with an RMS of -25 dB; pauses are shortened to 0.1 s."""
+    """Return speech of several voices with an RMS of -25 dB; pauses are shortened to 0.1 s."""
     sounds = []
     for voice, text in VOICES.items():
         command = ["espeak-ng", "-v", voice, "-s", "160", "--stdout", text]
         data = subprocess.run(command, capture_output=True, check=True).stdout
-        sounds.append(scipy.signal.resample_poly(np.frombuffer(data[44:], "<i2") / 32768.0, 2, 1))
+        sounds.append(scipy.signal.resample_poly(np.frombuffer(data[44:], "<i2") / 32768.0, RATE, 22050))
     recorded = [soundfile.read(path, always_2d=True) for path in sorted(RECORDINGS.glob("*_*.wav"))]
     sounds.append(np.concatenate([scipy.signal.resample_poly(sound[:, 0], RATE, rate) for sound, rate in recorded]))
     return [_normalized(_without_pauses(sound)) for sound in sounds]
 
 
 def _without_pauses(sound: np.ndarray) -> np.ndarray:
-    frames = sound[: len(sound) // 441 * 441].reshape(-1, 441)
+    step = RATE // 100
+    frames = sound[: len(sound) // step * step].reshape(-1, step)
     level = 10 * np.log10(np.mean(frames**2, axis=1) + 1e-12)
     loud = level > level.max() - 40
     kept = [index for index in range(len(frames)) if loud[max(0, index - 10) : index + 1].any()]
@@ -146,20 +175,28 @@ def two_sources(task: tuple[float, float, int]) -> list[tuple[bool, int]]:
     voices = [speech(len(VOICES) * 7 * number + offset, 10.0) for offset in (0, 1 + number % 5)]
     ears = sum(head().render(v, RATE, a) for v, a in zip(voices, (first, second), strict=True))
     result = rosafe.localize(in_noise(ears, 20, number, 2), RATE, head(), 1.0)
+    return both_found(result["tracks"], voices, (first, second))
+
+
+def both_found(
+    tracks: list[dict[str, Any]], voices: list[np.ndarray], truth: tuple[float, float]
+) -> list[tuple[bool, int]]:
+    """Return the outcome of `two_sources` from the tracks."""
     active = np.stack([_active(voice) for voice in voices])
     outcome = []
     for begin in range(1, 10):
         if active[:, begin * 100 : begin * 100 + 100].mean(axis=1).min() < 0.5:
             continue
-        azimuths = _present(result["tracks"], begin, begin + 1)
-        errors = np.abs(angles.difference(np.array(azimuths)[:, np.newaxis], np.array([first, second])))
+        azimuths = _present(tracks, begin, begin + 1)
+        errors = np.abs(angles.difference(np.array(azimuths)[:, np.newaxis], np.array(truth)))
         found = len(azimuths) > 0 and errors.min(axis=0).max() <= 10
         outcome.append((bool(found), int((errors.min(axis=1) > 10).sum())))
     return outcome
 
 
 def _active(voice: np.ndarray) -> np.ndarray:
-    level = 10 * np.log10(np.mean(voice[: len(voice) // 441 * 441].reshape(-1, 441) ** 2, axis=1) + 1e-12)
+    step = RATE // 100
+    level = 10 * np.log10(np.mean(voice[: len(voice) // step * step].reshape(-1, step) ** 2, axis=1) + 1e-12)
     return level > -35 - 20
 
 
@@ -174,49 +211,84 @@ def _present(tracks: list[dict[str, Any]], begin: float, end: float) -> list[flo
     return found
 
 
-def in_room(azimuth: float) -> dict[float, list[tuple[float, float, float]]]:
-    """Localize one source in a room, at each direct-to-reverberant ratio."""
-    found = {}
-    direct, late = room_response(azimuth)
-    for ratio in RATIOS:
-        number = zlib.crc32(f"room{azimuth}{ratio}".encode())
-        response = late * np.sqrt(np.sum(direct**2) / np.sum(late**2)) * 10 ** (-ratio / 20)
-        response[:, : direct.shape[1]] += direct
-        dry = speech(number, SECONDS)
-        ears = scipy.signal.oaconvolve(dry[np.newaxis], response, axes=-1)[:, : len(dry)]
-        result = rosafe.localize(in_noise(ears, 60, number), RATE, head(), 1.0)
-        found[ratio] = [(azimuth, *estimate) for estimate in at_seconds(result)]
-    return found
+# --- rooms ---
 
 
-def room_response(azimuth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the direct and the reverberant part (2, n) of a binaural room response: image sources through the head."""
-    import pyroomacoustics as pra
+@lru_cache(maxsize=len(PLACES) * 4)
+def reflections(number: int, ratio: float | None, heard: str) -> RoomReflections:
+    """Return the reflections of one of `PLACES` at a head, with a direct-to-reverberant ratio or that of the place."""
+    room = replace(PLACES[number].room, drr_db=ratio)
+    return RoomReflections(room, named_head(heard).filters(RATE), RATE, number)
 
-    absorption, order = pra.inverse_sabine(REVERBERATION, ROOM)
-    room = pra.ShoeBox(ROOM, fs=RATE, materials=pra.Material(absorption), max_order=order)
-    center = np.array([2.7, 2.2, 1.6])
-    angle = np.radians(azimuth)
-    room.add_source(center + DISTANCE * np.array([np.cos(angle), np.sin(angle), 0]))
-    room.add_microphone(center)
-    room.image_source_model()
-    offsets = room.sources[0].images.T - center
-    distance = np.linalg.norm(offsets, axis=1)
-    gains = np.asarray(room.sources[0].damping).reshape(-1, len(distance))[0] / distance
-    delay = np.round((distance - DISTANCE) / 343.0 * RATE).astype(int)
-    inside = delay < 0.8 * RATE
-    length = int(0.8 * RATE)
-    directions = np.degrees(np.arctan2(offsets[:, 1], offsets[:, 0]))
-    nearest = np.abs(angles.difference(DIRECTIONS[:, np.newaxis], directions)).argmin(axis=0)
-    impulses = np.zeros((len(DIRECTIONS), length))
-    is_late = inside & (delay > 0)
-    np.add.at(impulses, (nearest[is_late], delay[is_late]), gains[is_late])
-    filters = head().filters(RATE)
-    late = np.zeros((2, length))
-    for row, direction in zip(impulses, DIRECTIONS, strict=True):
-        response = filters.response(float(direction))
-        late += scipy.signal.oaconvolve(row[np.newaxis], response, axes=-1)[:, :length]
-    return filters.response(azimuth) / DISTANCE, late
+
+@lru_cache(maxsize=8)
+def named_head(name: str) -> rosafe.Head:
+    """Return a head for a name of `HEADS`."""
+    if name == "kemar":
+        return head()
+    if name == "surrey":
+        return rosafe.Head.from_sofa(SURREY, mirror=True)
+    return rosafe.Head.sphere() if name == "sphere" else rosafe.Head.pair(float(name.removeprefix("pair:")))
+
+
+def in_room(
+    number: int, ratio: float, heard: str, sounds: Sequence[tuple[np.ndarray, float]], turn: float = 0.0
+) -> np.ndarray:
+    """Return both ears (2, N) for sounds with azimuths relative to the head, which turns by `turn` until the end."""
+    place, frames = PLACES[number], len(sounds[0][0])
+    blocks = -(-frames // BLOCK)
+    yaw = place.yaw + turn * np.arange(0, blocks * BLOCK + 1, HOP) / frames
+    reverberation = Reverberation(reflections(number, ratio, heard), [place.distance] * len(sounds), BLOCK)
+    sources = [SourceRenderer(named_head(heard).filters(RATE)) for _ in sounds]
+    ears = np.zeros((2, blocks * BLOCK))
+    for first in range(0, blocks * BLOCK, BLOCK):
+        at = yaw[first // HOP : (first + BLOCK) // HOP + 1]
+        part = ears[:, first : first + BLOCK]
+        for index, (renderer, (sound, azimuth)) in enumerate(zip(sources, sounds, strict=True)):
+            samples = np.zeros(BLOCK)
+            samples[: len(sound[first : first + BLOCK])] = sound[first : first + BLOCK]
+            world = np.full(len(at), place.yaw + azimuth)
+            part += renderer.process(samples, angles.wrap(world - at))
+            part += reverberation.add(index, samples, world, at)
+        part += reverberation.tail()
+    return ears[:, :frames]
+
+
+class RoomTrial(NamedTuple):
+    """One talker in a room: place, ratio (dB), azimuth, head of the sound and of the model, turn in a second."""
+
+    place: int
+    ratio: float
+    azimuth: float
+    heard: str = "kemar"
+    model: str = "kemar"
+    turn: float = 0.0
+
+
+def room_trial(task: RoomTrial) -> tuple[list[tuple[float, float, float]], list[int]]:
+    """Localize a talker; return truth, azimuth and confidence of each second, and the number of other tracks."""
+    seconds = 1.0 if task.turn else ROOM_SECONDS
+    number = zlib.crc32(f"room{task.azimuth}{task.ratio}{task.place}{task.turn}".encode())
+    ears = in_room(task.place, task.ratio, task.heard, [(speech(number, seconds), task.azimuth)], task.turn)
+    yaw = [[0, 0], [1, task.turn]] if task.turn else 0.0
+    result = rosafe.localize(in_noise(ears, 60, number), RATE, named_head(task.model), 1.0, head_yaw=yaw)
+    estimates = [(task.azimuth, *estimate) for estimate in at_seconds(result)]
+    truth = np.array([task.azimuth, angles.lateral(task.azimuth)] if task.model != "kemar" else [task.azimuth])
+    others = []
+    for begin in range(1, int(seconds)):
+        azimuths = np.array(_present(result["tracks"], begin, begin + 1))[:, np.newaxis]
+        others.append(int((np.abs(angles.difference(azimuths, truth)).min(axis=1) > 10).sum()))
+    return estimates, others
+
+
+def room_pair(task: tuple[int, float, float, float]) -> list[tuple[bool, int]]:
+    """Localize two talkers of equal level in a room: place, ratio (dB) and azimuths."""
+    place, ratio, first, second = task
+    number = zlib.crc32(f"two{task}".encode()) % 1000
+    voices = [speech(len(VOICES) * 7 * number + offset, 10.0) for offset in (0, 1 + number % 5)]
+    ears = in_room(place, ratio, "kemar", list(zip(voices, (first, second), strict=True)))
+    result = rosafe.localize(in_noise(ears, 60, number, 2), RATE, head(), 1.0)
+    return both_found(result["tracks"], voices, (first, second))
 
 
 # --- figures ----------------------------------------------------------------------------------------------------
@@ -376,22 +448,145 @@ def section_two(run: Map) -> str:
     )
 
 
-def section_room(run: Map) -> str:
-    try:
-        import pyroomacoustics  # noqa: F401
-    except ImportError:
-        return "## Room\n\nNot measured: pyroomacoustics is not installed.\n"
-    trials: dict[float, list[Any]] = {ratio: [] for ratio in RATIOS}
-    for found in run(in_room, [float(azimuth) for azimuth in range(-90, 91, 10)]):
-        for ratio in RATIOS:
-            trials[ratio] += found[ratio]
+def section_rooms(run: Map) -> str:
+    tasks = [RoomTrial(*one) for one in itertools.product(range(len(PLACES)), RATIOS, map(float, DIRECTIONS[::EVERY]))]
+    trials: dict[tuple[int, float], list[Any]] = {}
+    others: dict[float, list[int]] = {}
+    for task, (found, wrong) in zip(tasks, run(room_trial, tasks), strict=True):
+        trials.setdefault((task.place, task.ratio), []).extend(found)
+        others.setdefault(task.ratio, []).extend(wrong)
+    each = {
+        ratio: figures(itertools.chain(*(trials[place, ratio] for place in range(len(PLACES))))) for ratio in RATIOS
+    }
+    rows = metric_rows(each)
+    rows["tracks elsewhere, mean number"] = [f"{np.mean(others[ratio]):.3f}" for ratio in RATIOS]
+    places = {}
+    for number, place in enumerate(PLACES):
+        within = [f"{figures(trials[number, ratio])['within']:.3f}" for ratio in RATIOS]
+        places[_description(place)] = [f"{_natural_ratio(number):.1f}", *within]
+    calibrated = calibration(list(itertools.chain(*trials.values())))
+    shares = {"estimates": [str(n) for _, n, _ in calibrated], "right": [f"{share:.3f}" for *_, share in calibrated]}
     return (
-        "## Room\n\nSpeech in a room of 6 x 5 x 3 m with a reverberation time of 0.4 s (image sources of "
-        "pyroomacoustics through the nearest direction of the horizontal plane), 1.5 m away, front half, noise at "
-        "60 dB. Goal: 0.90 at 5 dB.\n\n"
+        "## Rooms: one talker, matched head\n\n"
+        f"Speech in {len(PLACES)} rectangular rooms, from {len(DIRECTIONS[::EVERY])} directions, {ROOM_SECONDS:g} s "
+        "each, estimates from one second. Image sources and a diffuse tail through KEMAR "
+        "(rosafe/localization/rectangular_room.py); training uses none of these rooms and no image sources. The "
+        "reflections are scaled to the ratio of direct to reverberant energy. Noise at 60 dB. These rooms lack "
+        "furniture, walls that absorb some frequencies more than others, talkers that radiate to one side, and "
+        "elevated reflections with the ears' responses for their elevation (they have those of the horizontal "
+        "plane with the same lateral angle). 0 and 180 degrees count as one.\n\n"
+        + table("direct-to-reverberant ratio (dB)", RATIOS, rows)
+        + "\nEach room: sides, reverberation time, position of the head from the corner behind, right and below, its "
+        "direction, and the distance of the talker; the ratio that follows from the distance; shares within 5 degrees "
+        "at the ratios above.\n\n"
+        + table("room", ("own ratio (dB)", *(f"{ratio:g} dB" for ratio in RATIOS)), places)
+        + "\nCalibration of the confidence, all trials above:\n\n"
+        + table("confidence", [name for name, _, _ in calibrated], shares)
+    )
+
+
+def _description(place: Place) -> str:
+    sides = " x ".join(f"{side:g}" for side in place.room.size)
+    position = ", ".join(f"{at:g}" for at in place.room.head)
+    return (
+        f"{sides} m, {place.room.rt60:g} s, head at ({position}) m, turned by {place.yaw:g} degrees, "
+        f"{place.distance:g} m away"
+    )
+
+
+def _natural_ratio(number: int) -> float:
+    """Return the mean direct-to-reverberant ratio in dB of all directions of a place."""
+    place, room, filters = PLACES[number], reflections(number, None, "kemar"), head().filters(RATE)
+    ratios = []
+    for azimuth in DIRECTIONS[::6]:
+        early, gain = room.of_source(place.yaw + azimuth, place.distance, place.yaw)
+        rest = np.sum(early**2) + gain**2 * np.sum(room.tail**2)
+        ratios.append(10 * np.log10(np.sum(filters.response(float(azimuth)) ** 2) / rest))
+    return float(np.mean(ratios))
+
+
+def section_rooms_turning(run: Map) -> str:
+    places = range(len(PLACES))
+    directions = list(itertools.product(map(float, DIRECTIONS[::EVERY]), (0, 1, 2)))
+    tasks = [
+        RoomTrial((index + second) % len(places), ratio, azimuth, turn=20.0)
+        for ratio in RATIOS
+        for index, (azimuth, second) in enumerate(directions)
+    ]
+    trials: dict[float, list[Any]] = {}
+    for task, (found, _) in zip(tasks, run(room_trial, tasks), strict=True):
+        trials.setdefault(task.ratio, []).extend(found[-1:])
+    return (
+        "## Rooms: the head turns by 20 degrees within the second\n\nSpeech, matched head, the rooms above in turn; 0 "
+        "and 180 degrees are directions like any other.\n\n"
         + table(
-            "direct-to-reverberant ratio (dB)", RATIOS, metric_rows({r: figures(found) for r, found in trials.items()})
+            "direct-to-reverberant ratio (dB)",
+            RATIOS,
+            metric_rows({ratio: figures(found, poles=False) for ratio, found in trials.items()}),
         )
+    )
+
+
+def section_rooms_heads(run: Map) -> str:
+    rows: dict[str, list[str]] = {}
+    for title, heard, model in _heads():
+        front = title.endswith("front half")
+        directions = [float(azimuth) for azimuth in DIRECTIONS[::EVERY] if abs(azimuth) <= 90 or not front]
+        directions = [azimuth for azimuth in directions if abs(azimuth) <= 60 or not heard.startswith("pair")]
+        rosafe.localize(np.zeros((2, RATE)), RATE, named_head(model))  # learn before the workers need it
+        tasks = [
+            RoomTrial(index % len(PLACES), ratio, azimuth, heard, model)
+            for ratio in RATIOS
+            for index, azimuth in enumerate(directions)
+        ]
+        trials: dict[float, list[Any]] = {}
+        for task, (found, _) in zip(tasks, run(room_trial, tasks), strict=True):
+            trials.setdefault(task.ratio, []).extend(found)
+        for ratio, found in trials.items():
+            if front or model != "kemar":  # compared by the lateral angle
+                found = [(float(angles.lateral(a)), float(angles.lateral(b)), sure) for a, b, sure in found]
+            metrics = figures(found, poles=False)
+            row = [f"{metrics['within']:.3f}", f"{metrics['rms']:.1f}", f"{metrics['trials']:.0f}"]
+            rows[f"{title}, {ratio:g} dB"] = row
+    missing = "" if SURREY.exists() else " The Surrey head is missing here."
+    return (
+        "## Rooms: other heads and microphones\n\nSpeech as above, the rooms in turn, one for each direction. "
+        f"Directions are compared by their lateral angle. Pairs: up to 60 degrees from straight ahead.{missing}\n\n"
+        + table("sound, model, ratio", ("within 5 degrees", "RMS in degrees", "trials"), rows)
+    )
+
+
+def _heads() -> Iterable[tuple[str, str, str]]:
+    """Yield a title, the head of the sound and that of the model."""
+    yield "KEMAR, sphere", "kemar", "sphere"
+    if SURREY.exists():
+        yield "Surrey head, its own model, front half", "surrey", "surrey"
+        yield "Surrey head, KEMAR, front half", "surrey", "kemar"
+    if hasattr(rosafe.Head, "pair"):
+        for spacing in (0.058, 0.1):
+            yield f"pair of {100 * spacing:g} cm, its own model", f"pair:{spacing:g}", f"pair:{spacing:g}"
+
+
+def section_rooms_two(run: Map) -> str:
+    pairs = [(a, a + apart) for apart in (30, 60, 90) for a in range(-90, 91 - apart, 15)][::EVERY]
+    tasks = [
+        (index % len(PLACES), ratio, float(first), float(second))
+        for ratio in RATIOS
+        for index, (first, second) in enumerate(pairs)
+    ]
+    outcome: dict[float, list[tuple[bool, int]]] = {}
+    for task, found in zip(tasks, run(room_pair, tasks), strict=True):
+        outcome.setdefault(task[1], []).extend(found)
+    columns = [np.array(outcome[ratio], float).T for ratio in RATIOS]
+    rows = {
+        "both found": [f"{both.mean():.3f}" for both, _ in columns],
+        "other tracks, mean number": [f"{wrong.mean():.2f}" for _, wrong in columns],
+        "seconds": [str(len(both)) for both, _ in columns],
+    }
+    return (
+        "## Rooms: two talkers of equal level, 30 to 90 degrees apart in the front half\n\nMatched head, the rooms "
+        "above in turn, 10 s for each pair of positions. Counted as without a room.\n\n"
+        + table("direct-to-reverberant ratio (dB)", RATIOS, rows)
     )
 
 
@@ -430,25 +625,39 @@ SECTIONS: dict[str, Callable[[Map], str]] = {
     "speech": section_speech,
     "turning": section_turning,
     "two": section_two,
-    "room": section_room,
+    "rooms": section_rooms,
+    "rooms_turning": section_rooms_turning,
+    "rooms_two": section_rooms_two,
+    "rooms_heads": section_rooms_heads,
     "other": section_other,
     "noise": section_noise,
     "mismatch": section_mismatch,
 }
 
 
-def main(names: list[str]) -> None:
+def main() -> None:
     """Measure the named sections, or all, and write the result; sections that are not named keep their text."""
-    texts = written_sections() if names else {}
+    global EVERY, RATE
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("sections", nargs="*", metavar="SECTION", help=", ".join(SECTIONS))
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="use each Nth direction; writes nothing")
+    parser.add_argument("--rate", type=int, default=RATE, metavar="HZ", help="another sample rate; writes nothing")
+    options = parser.parse_args()
+    if unknown := set(options.sections) - set(SECTIONS):
+        parser.error(f"SECTION: expected some of {', '.join(SECTIONS)}, got {', '.join(sorted(unknown))}")
+    written = (options.every, options.rate) == (EVERY, RATE)
+    EVERY, RATE = options.every, options.rate
+    texts = written_sections() if options.sections else {}
     rosafe.localize(np.zeros((2, RATE)), RATE, head())  # learn before the workers start
     with ProcessPoolExecutor(int(os.environ.get("WORKERS", "2"))) as pool:
-        for name in names or SECTIONS:
+        for name in options.sections or SECTIONS:
             begin = time.monotonic()
             texts[name] = SECTIONS[name](lambda function, tasks: pool.map(function, tasks, chunksize=4))
             print(texts[name], f"({name}: {time.monotonic() - begin:.0f} s)\n", sep="\n", flush=True)
             ordered = [f"{MARK.format(section)}\n{texts[section]}" for section in SECTIONS if section in texts]
             intro = "# Localization\n\nMeasured by benchmarks/localization.py; method: docs/localization.md.\n\n"
-            RESULT.write_text(intro + "\n".join(ordered))
+            if written:
+                RESULT.write_text(intro + "\n".join(ordered))
 
 
 def written_sections() -> dict[str, str]:
@@ -458,4 +667,4 @@ def written_sections() -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -88,7 +88,7 @@ class Clock:
 def play(trees: int, block: int, seconds: float, cores: list[int], begin: float) -> tuple[int, list[float], float]:
     """Play from `begin` (monotonic time); return lost frames, latencies after `SETTLE_SECONDS`, and processor time."""
     os.sched_setaffinity(0, cores)
-    from rosafe.ros1.component.audio import AudioRing
+    from rosafe.audio.stream.ring import AudioRing
     from rosafe.tree.tree import Tree
 
     noise = (np.random.default_rng(0).standard_normal((2, block)) * 2e8).astype(np.int32)

@@ -30,7 +30,7 @@ from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
 from rosafe.interface.citing import condition
 from rosafe.representations.registry import builtin_stages
-from rosafe.view.axes import style
+from rosafe.results.view.axes import style
 
 FOLDER = Path(__file__).resolve().parent / "reference"
 KINDS = {kind: stage.REPRESENTATION for kind, stage in builtin_stages().items()}

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import rosafe
 from rosafe.audio.devices.scene import Scene
 from rosafe.representations.registry import builtin_stages
-from rosafe.view.axes import style
+from rosafe.results.view.axes import style
 
 RATE, SECONDS, COLUMNS = 44100, 2, 3
 PARAMETERS = {"ac_wSizeSec": 0.03, "pi_confThres": 0.4}  # suitable for the low voice and the noise

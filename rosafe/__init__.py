@@ -29,12 +29,12 @@ _MODULES = {
     "enhance": "rosafe.localization.enhancement",
     "load": "rosafe.results.readers",
     "localize": "rosafe.localization.localize",
-    "plot": "rosafe.view.plot",
+    "plot": "rosafe.results.view.plot",
     "process": "rosafe.processing.process",
     "process_batch": "rosafe.processing.features",
     "resynthesize": "rosafe.processing.resynthesis",
     "to_db": "rosafe.processing.features",
-    "to_xarray": "rosafe.view.dataset",
+    "to_xarray": "rosafe.results.view.dataset",
 }
 
 __all__ = ["__version__", *_MODULES]

@@ -17,12 +17,12 @@ from rosafe.localization.enhancement import direction_mask as direction_mask
 from rosafe.localization.enhancement import enhance as enhance
 from rosafe.results.readers import load as load
 from rosafe.localization.localize import localize as localize
-from rosafe.view.plot import plot as plot
+from rosafe.results.view.plot import plot as plot
 from rosafe.processing.process import process as process
 from rosafe.processing.features import process_batch as process_batch
 from rosafe.processing.resynthesis import resynthesize as resynthesize
 from rosafe.processing.features import to_db as to_db
-from rosafe.view.dataset import to_xarray as to_xarray
+from rosafe.results.view.dataset import to_xarray as to_xarray
 
 __version__: str
 __all__ = ['__version__', 'Head', 'Localizer', 'PRESETS', 'Result', 'Resynthesizer', 'Stream', 'deltas', 'direction_mask', 'enhance', 'load', 'localize', 'plot', 'process', 'process_batch', 'resynthesize', 'to_db', 'to_xarray']

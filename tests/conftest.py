@@ -19,15 +19,15 @@ from tests.audio.pulseaudio import PulseServer
 from tests.dsp.implementations import NUMPY, Choice, levels
 
 # Folders whose tests start commands, browsers, compilers
-STARTING = ("commands", "demo", "web/live", "packaging", "setups")
+STARTING = ("commands", "demo", "web/live", "packaging", "ros2", "tree/setups")
 # Folders whose tests start programs as users do, not as forks
 OF_THE_START = ("demo", "packaging", "soak", "ros1/startup")
 STARTING_FILES = (  # the same for single files
     "ros1/bass/test_calibration.py",
     "audio/test_hostile_files.py",
     "ros1/bass/test_record.py",
-    "eltclsh/test_script.py",
-    "eltclsh/test_terminal.py",
+    "commands/eltclsh/test_script.py",
+    "commands/eltclsh/test_terminal.py",
     "web/genomix/test_packed.py",
     "ros1/localizer/test_recovery.py",
     "results/test_damaged.py",
@@ -53,8 +53,8 @@ LONG_FILES = (  # dozens of seconds of computation; scripts/test --fast has othe
     "ros1/localizer/test_long_silence.py",
     "processing/test_stream.py",
     "validation/test_validate.py",
-    "view/test_figure.py",
-    "view/test_plot.py",
+    "results/view/test_figure.py",
+    "results/view/test_plot.py",
 )
 LONGEST_FILES = (  # they begin first, so that no process works on one of them while the others have nothing to do
     "packaging/test_lint.py",
@@ -79,7 +79,6 @@ NO_KERNELS = (  # tests of stages that have no kernel: the same code runs with k
 EACH_VARIANT = 4  # of the cases of a test, each fourth is repeated with numpy, or with kernels of an older processor
 EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal suite; all with scripts/test --long
     "commands/test_corpus.py::test_names_that_are_not_utf8": 2,
-    "commands/test_writers.py::test_many_concurrent_writers": 2,
     "dsp/test_kernels.py::test_autocorrelation": 4,
     "dsp/test_processors.py::test_every_kernel": 3,
     "web/genomix/test_guide.py::test_usage_patterns_of_published_scripts": 2,
@@ -92,10 +91,10 @@ EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal s
     "packaging/test_catkin.py::test_executables": 2,
     "plugins/test_documents.py::test_examples": 2,
     "plugins/test_versions.py::test_a_client_with_another_plugin": 2,
-    "setups/test_parsing_time.py::test_time_is_bounded": 4,
-    "setups/test_parsing_time.py::test_time_is_linear": 5,
+    "tree/setups/test_parsing_time.py::test_time_is_bounded": 4,
+    "tree/setups/test_parsing_time.py::test_time_is_linear": 5,
     "tree/test_schedules.py::test_any_order_of_events": 2,
-    "view/test_plot.py::test_silent_and_very_short_signals": 3,
+    "results/view/test_plot.py::test_silent_and_very_short_signals": 3,
 }
 ELSEWHERE = ("aarch64", "nehalem", "clang")  # kernels under qemu, or built by another compiler
 

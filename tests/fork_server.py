@@ -55,7 +55,7 @@ COMMANDS: Mapping[str, Sequence[str]] = {  # what commands of `rosafe` import wh
     "localize": (*_OFFLINE, "rosafe.ros1.localizer.node", *NODES),
     "plot": (*_OFFLINE, "matplotlib.figure", "matplotlib.backends.backend_agg"),
     "process": (*_OFFLINE, "h5py"),
-    "record": (*_SOUNDS, "rosafe.ros1.bass.recording.recorder", "rosafe.audio.devices.scene"),
+    "record": (*_SOUNDS, "rosafe.ros1.bass.recording", "rosafe.audio.devices.scene"),
     "trace": _OFFLINE,
 }
 SCRIPTS = {name: ROOT / "scripts" / name for name in ("rosAFE-ros", "bass-ros", "genomixd", "rosafe")}

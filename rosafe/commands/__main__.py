@@ -37,8 +37,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run `rosafe` and return its exit code. SystemExit: 2 for a wrong command line, 0 after -h and --version."""
     name = "rosafe"
     try:
-        words = without_names(sys.argv[1:] if argv is None else argv)
-        words = without_remappings(words) if words[:1] and words[0] in _LAUNCHED else words
+        words = _without_ros1(sys.argv[1:] if argv is None else argv)
         options, rest = _parser(words).parse_known_args(words)
         name = f"rosafe {options.command}"
         if hasattr(options, "missing"):
@@ -63,6 +62,14 @@ def main(argv: list[str] | None = None) -> int:
         return 130
 
 
+def _without_ros1(words: list[str]) -> list[str]:
+    """Return a command line without arguments that roslaunch adds; those of ROS 2 have the same form."""
+    if words[:1] == ["ros2"]:
+        return words
+    words = without_names(words)
+    return without_remappings(words) if words[:1] and words[0] in _LAUNCHED else words
+
+
 def _parser(words: list[str]) -> argparse.ArgumentParser:
     """Return a parser with the subcommand of the command line, or with a line for each without importing any."""
     parser = Parser(
@@ -74,7 +81,8 @@ def _parser(words: list[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"rosafe {VERSION}")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
-    names = [module.name for module in pkgutil.iter_modules(commands.__path__) if not module.name.startswith("_")]
+    modules = [module for module in pkgutil.iter_modules(commands.__path__) if not module.ispkg]
+    names = [module.name for module in modules if not module.name.startswith("_")]
     chosen = words[0].replace("-", "_") if words else ""
     if chosen in names:
         if chosen in _WITHOUT_PLUGINS:

@@ -49,6 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n"
         "  rosafe demo                               the built-in scene; scripts/demo installs what is missing first\n"
+        "  scripts/demo 'scene:?rt60=0.4'            the same in a room with a reverberation time of 0.4 s\n"
         "  scripts/demo speech.wav --seconds 5       a sound file with two channels\n"
         "  scripts/demo plughw:1,0 --out /tmp/me     a microphone pair"
     )
@@ -181,7 +182,8 @@ def choose(argument: str, seconds: float = math.inf) -> DemoSound:
     title, rate = path.name, source.sample_rate
     if argument.startswith("scene:"):
         frames = getattr(source, "frames", None)
-        title = title.removeprefix("scene:") if hasattr(source, "scene") else "A source moves from left to right"
+        walk = "A source moves from left to right" + " in a room" * ("rt60=" in argument)
+        title = title.removeprefix("scene:") if hasattr(source, "scene") else walk
     sound = DemoSound(device, title, rate, seconds, source)
     if frames is None or frames >= seconds * rate:
         return sound
@@ -328,7 +330,7 @@ async def _follow(
     launcher: Launcher, sound: DemoSound, ports: Mapping[str, _Port], begin: Mapping[str, tuple[int, int]]
 ) -> None:
     """Wait until all ports have the seconds of the sound, or it has ended; `begin` has starts and index of each."""
-    from rosafe.view import report
+    from rosafe.results.view import report
 
     say(f"recording {len(ports)} ports for {sound.seconds:.1f} s")
     elapsed, shown, moved = 0.0, 0.0, time.monotonic()
@@ -356,8 +358,8 @@ def _show(sound: DemoSound, ports: Mapping[str, _Port], parameters: Any, plot_fi
     import numpy as np
 
     from rosafe.localization import angles
-    from rosafe.view import axes, figure, report  # matplotlib takes a second to import
-    from rosafe.view.representations import Representations
+    from rosafe.results.view import axes, figure, report  # matplotlib takes a second to import
+    from rosafe.results.view.representations import Representations
 
     def row(port: _Port) -> report.PortRow:
         pace = np.inf if len(port.arrivals) < 2 else np.mean(np.diff(port.arrivals))
@@ -409,11 +411,11 @@ def _directions(sound: DemoSound, port: _Port) -> tuple[dict[str, Any] | None, d
     from rosafe.localization import angles
     from rosafe.localization.localize import localize
     from rosafe.localization.localizer import SPHERE
-    from rosafe.view import report
+    from rosafe.results.view import report
 
     scene = getattr(sound.source, "scene", None)
     head = SPHERE if scene is None else scene.head
-    say("\nlocalizing; at the first use of a head and sample rate, they are learned, which takes up to 30 s")
+    say("\nlocalizing; at the first use of a head and sample rate, they are learned, which takes up to a minute")
     try:
         found = localize(np.concatenate(port.pieces, axis=-1), sound.sample_rate, head, WINDOW_SECONDS)
     except ValueError as problem:

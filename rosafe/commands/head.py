@@ -1,5 +1,6 @@
 """Learn the model of a head once, for `rosafe localize --head FILE`, from a SOFA file or from recordings.
 
+pair:SPACING, such as pair:0.058, is two microphones with this distance in m and without a head.
 RECORDINGS.csv has the columns file, azimuth_deg: sound files with two ears of one source at a known direction each,
 left positive. The directions must surround the head, at most 30 degrees apart; several files for one direction are
 allowed."""
@@ -21,11 +22,13 @@ _RATE = 44100
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
-        "rosafe head learn HEAD.sofa|RECORDINGS.csv -o FILE [--rate HZ] [--[no-]mirror]\n"
+        "rosafe head learn HEAD.sofa|RECORDINGS.csv|pair:SPACING -o FILE [--rate HZ] [--[no-]mirror]\n"
         "                         [--set NAME=VALUE ...] [--force]"
     )
     parser.add_argument("action", type=_action, metavar="learn", help="what to do")
-    parser.add_argument("inputs", nargs="*", metavar="SOURCE", help="SOFA file, or CSV file with a list of recordings")
+    parser.add_argument(
+        "inputs", nargs="*", metavar="SOURCE", help="SOFA file, CSV file with a list of recordings, or pair:SPACING"
+    )
     parser.add_argument("-o", "--to", dest="to", metavar="FILE", required=True, help="the model")
     parser.add_argument(
         "--rate",
@@ -55,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
     target = Path(options.to)
     check_target(target, options.force)
     from rosafe.audio.files.audiofile import AudioFileError
-    from rosafe.localization.head import Head
+    from rosafe.localization.head import Head, computed_head
     from rosafe.localization.model_cache import terminal_progress
     from rosafe.localization.recordings import learn_recordings
     from rosafe.localization.training import learn_head
@@ -68,8 +71,9 @@ def run(options: argparse.Namespace) -> int:
                 raise ValueError(f"--mirror: expected a SOFA file, got {source}")
             model = learn_recordings(source, options.rate, parameters, progress)
         else:
+            head = None if options.mirror is not None else computed_head(source)
             model = learn_head(
-                Head.from_sofa(source, options.mirror), float(options.rate or _RATE), parameters, progress
+                head or Head.from_sofa(source, options.mirror), float(options.rate or _RATE), parameters, progress
             )
         if progress:
             progress(1.0)

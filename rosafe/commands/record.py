@@ -1,9 +1,9 @@
 """Record sound to a WAV file or a rosbag with a level meter; without an output, show the meter only.
 
-The sound comes from a running bass (topic bass/Audio) or, without ROS, from a --device: a sound card, file:PATH,
-bag:PATH or scene:, named as for Acquire of bass. OUT.wav contains the exact samples with 32 bits; above 4 GiB it is an
-RF64 file, which libsndfile reads like any WAV. OUT.bag is for `rosbag play` and the device bag:. Lost frames are
-replaced by silence and reported. Ctrl-C ends the recording with a complete file."""
+The sound comes from a running bass (topic bass/Audio), another --topic, or a --device: a sound card, file:PATH,
+bag:PATH, topic:/NAME or scene:, named as for Acquire of bass. Only topics need ROS. OUT.wav contains the exact samples
+with 32 bits; above 4 GiB it is an RF64 file, which libsndfile reads like any WAV. OUT.bag is for `rosbag play` and the
+device bag:. Lost frames are replaced by silence and reported. Ctrl-C ends the recording with a complete file."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from rosafe.system.terminal import printable
 if TYPE_CHECKING:
     from rosafe.audio.devices import SoundSource
     from rosafe.audio.files.levels import LevelMeter
-    from rosafe.ros1.bass.recording.outputs import Output
-    from rosafe.ros1.bass.recording.recorder import SoundRecorder
+    from rosafe.ros1.bass.recording import Output, SoundRecorder
 
 _TOPIC = "bass/Audio"
 _EARS = ("left", "right")
 _RATE = 44100  # of a device that does not define a rate
 _MIN_SECONDS, _MAX_SECONDS = 1e-6, 1e7
+_STALL_SECONDS = 5.0  # without new sound on a topic, until it counts as ended
 _CALIBRATION_SECONDS = 5.0
 _DIFFERENCE = 1.0  # dB; above this difference between the ears, one value does not fit both
 
@@ -49,8 +49,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("output", nargs="?", metavar="OUT", help="file to write, ending in .wav or .bag")
     source = parser.add_mutually_exclusive_group()
-    source.add_argument("--device", metavar="NAME", help="record from this device without ROS; see --list")
-    source.add_argument("--topic", metavar="NAME", help=f"topic of the sound (default: {_TOPIC})")
+    source.add_argument("--device", metavar="NAME", help="record from this device; see --list")
+    source.add_argument("--topic", metavar="NAME", help=f"the same as --device topic:NAME (default: {_TOPIC})")
     parser.add_argument(
         "--calibrate",
         type=option_types.number(0, 200, "a level in dB SPL, such as 94,"),
@@ -88,6 +88,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  rosafe record --device plughw:1,0              # check the levels of a sound card\n"
         "  rosafe record speech.wav --device plughw:1,0   # until Ctrl-C\n"
         "  rosafe record speech.bag --seconds 60          # the sound of a running bass\n"
+        "  rosafe record speech.wav --device topic:/audio # the sound of another driver\n"
         "  rosafe record --calibrate 94 --device plughw:1,0"
     )
 
@@ -166,13 +167,14 @@ def _is_input(path: Path, device: str) -> bool:
 
 def _open_source(options: argparse.Namespace, stopping: threading.Event) -> SoundSource:
     try:
-        if options.device is not None:
+        device = options.device if options.device is not None else f"topic:{options.topic or _TOPIC}"
+        if not device.startswith("topic:"):
             from rosafe.audio.devices import open_source
             from rosafe.ros1.transport.paths import prefer_pypi_packages
 
             prefer_pypi_packages()
-            return open_source(options.device, options.rate, options.chunk, stopping)
-        from rosafe.ros1.bass.recording.topic_source import TopicSource
+            return open_source(device, options.rate, options.chunk, stopping)
+        from rosafe.ros1.bass.topic_source import TopicSource
         from rosafe.ros1.component.generate import GenerationError
         from rosafe.ros1.component.startup import become_node
         from rosafe.ros1.transport.master import MasterError
@@ -181,14 +183,14 @@ def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Soun
             become_node("rosafe_record")
         except (MasterError, GenerationError) as problem:
             raise CommandError(f"{problem}; or record from a --device without ROS") from None
-        return TopicSource(options.topic or _TOPIC, options.rate, stopping)
+        return TopicSource(device.removeprefix("topic:"), options.rate, 0, stopping, _STALL_SECONDS)
     except ComponentError as problem:
         raise CommandError(problem.reason) from None
 
 
 def _record(path: Path | None, options: argparse.Namespace, stopping: threading.Event) -> int:
     from rosafe.commands._meter import Meter
-    from rosafe.ros1.bass.recording.recorder import SoundRecorder
+    from rosafe.ros1.bass.recording import SoundRecorder
 
     with ExitStack() as stack:
         # The file is created before the source is opened, so that a second recorder of the same file fails at once.
@@ -296,14 +298,15 @@ def _opened(part: AtomicOutput | None, options: argparse.Namespace, source: Soun
 
 
 def _open_output(part: AtomicOutput, options: argparse.Namespace, source: SoundSource) -> Output:
-    from rosafe.ros1.bass.recording.outputs import BagWriter, WavFile
+    from rosafe.ros1.bass.recording import BagWriter, WavFile
 
     descriptor = part.begin()
     if part.target.suffix.lower() == ".wav":
         return WavFile(descriptor, source.sample_rate)
-    # A published stream keeps its frame numbers and its name.
-    chunk, newest = getattr(source, "frames_per_chunk", options.chunk), getattr(source, "newest", 0)
-    return BagWriter(descriptor, source.sample_rate, chunk, f"/{_TOPIC}" if options.device else source.name, newest)
+    # A port Audio keeps its frame numbers and its name.
+    chunk = getattr(source, "port_chunk", 0)
+    topic, newest = (getattr(source, "topic", ""), getattr(source, "newest", 0)) if chunk else (f"/{_TOPIC}", 0)
+    return BagWriter(descriptor, source.sample_rate, chunk or options.chunk, topic, newest)
 
 
 def _summary(recorder: SoundRecorder, name: str, sample_rate: int) -> str:

@@ -19,11 +19,11 @@ from rosafe.commands import CommandError
 from rosafe.commands._component import component, format_error, prepare
 from rosafe.declarations import ros_names
 from rosafe.interface import MAX_SETUP, ROSAFE, ComponentError
-from rosafe.setups import LOCALIZER_FILES, Setup, SetupError, read, write
 from rosafe.system import option_types
 from rosafe.system.input import read_regular
 from rosafe.system.output import write_whole
 from rosafe.system.terminal import printable
+from rosafe.tree.setups import LOCALIZER_FILES, Setup, SetupError, read, write
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -98,11 +98,15 @@ def read_file(name: str) -> Setup:
 def _absolute(localizer: Mapping[str, Any], setup_file: Path) -> dict[str, Any]:
     """Return the settings of the localizer with absolute paths; relative ones are relative to the setup."""
 
+    from rosafe.localization.pair import PREFIX  # such names are not paths
+
     def path(value: str) -> str:
         return str((setup_file.parent / Path(value).expanduser()).absolute())
 
     return {
-        name: path(value) if name in LOCALIZER_FILES and value not in ("", "sphere", "none") else value
+        name: path(value)
+        if name in LOCALIZER_FILES and value not in ("", "sphere", "none") and not value.startswith(PREFIX)
+        else value
         for name, value in localizer.items()
     }
 

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 from rosafe.commands._component import format_error, open_graph
 from rosafe.commands._parameters import add_mirror
 from rosafe.interface import ComponentError
-from rosafe.setups import AcquireSettings, Setup, write
 from rosafe.system import option_types
+from rosafe.tree.setups import AcquireSettings, Setup, write
 
 if TYPE_CHECKING:
     from rosafe.commands._launcher import Launcher

@@ -9,7 +9,7 @@ from pathlib import Path
 import rosafe
 from rosafe.representations.registry import builtin_stages
 
-from . import BASS, citation_file, citing, files, functions, reference
+from . import BASS, citation_file, citing, files, functions, reference, ros2
 from .rosafe import derive
 
 ROOT = Path(__file__).parents[2]
@@ -19,15 +19,15 @@ def main(argv: list[str] | None = None) -> int:
     """Write the files and list those that changed; with ``--check`` only list them, and return 1 if there are any."""
     parser = argparse.ArgumentParser(
         prog="python3 -m rosafe.interface",
-        description="Write the .msg, .srv and .action files, their lists in CMakeLists.txt, docs/parameters.md, "
-        "docs/citing.md, CITATION.cff and rosafe/__init__.pyi.",
+        description="Write the .msg, .srv and .action files of ROS 1 and ROS 2, their lists in CMakeLists.txt, "
+        "docs/parameters.md, docs/citing.md, CITATION.cff and rosafe/__init__.pyi.",
         epilog="example: python3 -m rosafe.interface --check",
     )
     parser.add_argument("--check", action="store_true", help="write nothing, only list the files that are out of date")
     options = parser.parse_args(argv)
     kinds = {kind: stage.REPRESENTATION for kind, stage in builtin_stages().items()}  # without the user's plugins
     components = (derive(kinds), BASS)
-    expected = files.all_files(ROOT, components)
+    expected = files.all_files(ROOT, components) | ros2.all_files(ROOT)
     expected[ROOT / "docs" / "parameters.md"] = reference.markdown(components, kinds)
     expected[ROOT / "docs" / "citing.md"] = citing.markdown(kinds)
     expected[ROOT / "CITATION.cff"] = citation_file.text(citing.references(kinds.values(), {}))

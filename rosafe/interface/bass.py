@@ -33,7 +33,7 @@ BASS = ComponentSpec(
                     "device",
                     "string",
                     "hw:1,0",
-                    "ALSA name of the sound device, file:PATH, bag:PATH, scene: or scene:FILE.yaml",
+                    "ALSA name of the sound device, file:PATH, bag:PATH, topic:/NAME, scene: or scene:FILE.yaml",
                 ),
                 Parameter(
                     "sampleRate",

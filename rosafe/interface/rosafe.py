@@ -304,8 +304,17 @@ _LOCALIZER_MESSAGES: dict[str, Struct] = {
         ("level", "double"),
         ("first_seen", TIME),
         ("last_seen", TIME),
+        ("speech", "double"),
     ),
     "SoundSources": (("header", "::Header"), ("sources", "sequence<::SoundSource>")),
+    "SourceAudio": (
+        ("header", "::Header"),
+        ("id", "unsigned long"),
+        ("azimuth", "double"),
+        ("sample_rate", "unsigned long"),
+        ("first_sample", "unsigned long long"),
+        ("samples", "sequence<short>"),
+    ),
     "DirectionPosterior": (
         ("header", "::Header"),
         ("azimuths", "sequence<double>"),

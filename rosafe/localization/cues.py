@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.numeric_limits import FloatArray, as_numbers
 from rosafe.interface.arguments import check_parameters
+from rosafe.localization.sphere import SPEED_OF_SOUND
 from rosafe.processing.stream import Stream
 from rosafe.representations import STAGES
 
 KINDS = ("itd", "ild", "ic", "ratemap")  # the representations that localization needs
-# Sound is amplified by 100 dB: the representations add a small constant to energies, which would matter at low levels.
-PARAMETERS = {"pp_bLevelScaling": True, "pp_refSPLdB": 0.0}
-ITD_BINS, MAX_ITD = 67, 1.1e-3  # of the histogram from -MAX_ITD to MAX_ITD, s
+# Sound is amplified by 140 dB: the representations add a small constant to energies, which would matter at low levels.
+# The high-pass removes a constant offset of the microphones and most of mains hum; see `rosafe.localization.hum`.
+PARAMETERS = {"pp_bLevelScaling": True, "pp_refSPLdB": -40.0, "pp_bRemoveDC": True, "pp_cutoffHzDC": 150.0}
+ITD_BINS, MAX_ITD = 67, 1.1e-3  # of the histogram from -MAX_ITD to MAX_ITD, s, for a head
 ILD_BINS, MAX_ILD = 61, 30.0  # dB
 COHERENCE_CLASSES = 6
 COHERENCE_RANGE = 2.6  # decades of 1 - coherence below 1
@@ -26,7 +28,8 @@ MAX_CHANNELS = 128  # of a model
 CLASSES = COHERENCE_CLASSES * LEVEL_CLASSES
 FLOOR_QUANTILE = 0.02  # of the levels in a window: the floor
 MAX_VALUE = 1e100  # of a feature: sums of larger ones overflow
-MIN_LEVEL = -130.0  # dB, of the ratemap of a sound with full scale 1; channels below have no cues
+MIN_LEVEL = -150.0  # dB, of the ratemap of a sound with full scale 1; channels below have no cues
+RANGE_DB = 60.0  # a channel that is weaker than the strongest one by more contains only its skirt: no cues
 
 
 def describe(sample_rate: float, parameters: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -74,19 +77,25 @@ def scaling_db(parameters: Mapping[str, Any]) -> float:
     return float(100.0 - parameters["pp_refSPLdB"]) if parameters["pp_bLevelScaling"] else 0.0
 
 
-def quantize(features: Mapping[str, Any], gain_db: float) -> Cues:
-    """Quantize the representations `itd`, `ild`, `ic` (C, F) and `ratemap` (2, C, F); see `scaling_db`."""
+def max_itd(spacing: float | None) -> float:
+    """Return the limit in s of the histogram of the ITD for microphones with a spacing in m; None for a head."""
+    return MAX_ITD if spacing is None else 1.25 * spacing / SPEED_OF_SOUND + 1e-4
+
+
+def quantize(features: Mapping[str, Any], gain_db: float, max_itd: float) -> Cues:
+    """Quantize the representations `itd`, `ild`, `ic` (C, F) and `ratemap` (2, C, F); see `scaling_db`, `max_itd`."""
     itd, ild, coherence, ratemap = (np.asarray(features[kind], np.float64) for kind in KINDS)
     minimum = MIN_LEVEL + gain_db
     level = 10 * np.log10(np.maximum(ratemap[0] + ratemap[1], 10 ** ((minimum - 10) / 10)))
+    least = np.maximum(minimum, level.max(axis=0) - RANGE_DB)
     decades = np.log10(np.maximum(1 - coherence, 1e-9)) + COHERENCE_RANGE
     coherence_class = _bin(decades / COHERENCE_RANGE, COHERENCE_CLASSES)
     first = (np.arange(len(itd))[:, np.newaxis] * COHERENCE_CLASSES + coherence_class) * LEVEL_CLASSES
     return Cues(
-        np.ascontiguousarray((first * ITD_BINS + _bin((itd / MAX_ITD + 1) / 2, ITD_BINS)).T),
+        np.ascontiguousarray((first * ITD_BINS + _bin((itd / max_itd + 1) / 2, ITD_BINS)).T),
         np.ascontiguousarray((first * ILD_BINS + _bin((ild / MAX_ILD + 1) / 2, ILD_BINS)).T),
         np.ascontiguousarray(level.T),
-        np.ascontiguousarray(((level > minimum) & (coherence > 0)).T),
+        np.ascontiguousarray(((level > least) & (coherence > 0)).T),
     )
 
 

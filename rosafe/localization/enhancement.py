@@ -155,7 +155,7 @@ class _Enhancer:
         if not self._view.shape[1]:
             return np.empty((model.channels, 0))
         features = process(self._view, self._rate, parameters=self._values(), outputs=list(cues.KINDS), pad=True)
-        quantized = cues.quantize(features, cues.scaling_db(model.parameters))
+        quantized = cues.quantize(features, cues.scaling_db(model.parameters), model.max_itd)
         mask = np.empty((model.channels, len(quantized.level)))
         for begin in range(0, mask.shape[1], WINDOW):
             frames = slice(begin, begin + WINDOW)
@@ -166,7 +166,7 @@ class _Enhancer:
 
     def _probability(self, model: DirectionModel, found: cues.Cues, around: FloatArray) -> FloatArray:
         """Return the probability (F, C) that a frame of a channel comes from the target."""
-        terms = model.terms(*model.rows(found, cues.floors(around)))
+        terms = model.unweighted_terms(*model.rows(found, cues.floors(around)))
         likelihood = np.exp(SHARPNESS * (terms - terms.max(axis=-1, keepdims=True)), dtype=np.float64)
         near, far = self._distance <= WIDTH + 1e-9, self._distance > WIDTH + GAP
         wanted = likelihood[..., near if near.any() else self._distance == self._distance.min()].mean(axis=-1)
@@ -175,7 +175,7 @@ class _Enhancer:
     def enhance(self) -> FloatArray:
         """Return the enhanced sound (2, N)."""
         mask, samples = self.mask(), self._view.shape[1]
-        values = self._values()
+        values = {**self._values(), "pp_bRemoveDC": False}  # the high-pass is for the cues only
         hop = FrameGrid.design(self._rate, "ild", values).hop
         step, context = (-(-round(seconds * self._rate) // hop) for seconds in (_BLOCK_SECONDS, _CONTEXT_SECONDS))
         output = np.empty((2, samples))

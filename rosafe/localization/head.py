@@ -18,36 +18,41 @@ from rosafe.dsp.erb import bandwidth
 from rosafe.dsp.numeric_limits import LIMIT, FloatArray, as_numbers
 from rosafe.localization import angles
 from rosafe.localization.filters import HOP, HeadFilters, SourceRenderer
+from rosafe.localization.pair import MAX_SPACING, MIN_SPACING, PREFIX, pair_filters
 from rosafe.localization.sofa import MAX_NUMBERS, MAX_RATE, MIN_RATE, read_sofa
-from rosafe.localization.sphere import sphere_filters
+from rosafe.localization.sphere import SPEED_OF_SOUND, sphere_filters
 from rosafe.system.terminal import printable
 
 _SYMMETRY = 1e-6  # of the energy; below, two ears count as mirrored
-_CUE_RATE = 48000.0  # Hz, at which the cues of the sphere are computed
-_MAX_ITD = 0.0012  # s
+_CUE_RATE = 48000.0  # Hz, at which the cues of computed heads are computed
+_MAX_ITD = 0.0012  # s, of a head
 _MAX_FILTERS = 4  # sample rates whose filters are kept
 
 
 class Head:
     """A head: impulse responses of both ears for directions in the horizontal plane.
 
-    Create it by `Head.sphere` or `Head.from_sofa`.
+    Create it by `Head.sphere`, `Head.pair` or `Head.from_sofa`.
 
     Parameters
     ----------
     name : str
-        `sphere`, or the path of the SOFA file.
+        `sphere`, `pair:` and the spacing in m, or the path of the SOFA file.
     azimuths : ndarray, (A,)
         Measured directions in degrees, left positive, ascending in (-180, 180].
     responses : ndarray, (A, 2, N), or None
-        Impulse responses of the left and the right ear; None for the sphere, whose responses are computed.
+        Impulse responses of the left and the right ear; None if they are computed.
     sample_rate : float
         Of the responses, Hz.
     front_only : bool
         Whether the responses cover the front half only.
+    spacing : float, optional
+        Of two microphones without a head, m.
 
     Attributes
     ----------
+    spacing : float or None
+        Distance of two microphones without a head, m; None for a head.
     front_only : bool
         Whether the responses cover the front half (-90 to 90 degrees) only.
 
@@ -67,10 +72,12 @@ class Head:
         responses: FloatArray | None,
         sample_rate: float,
         front_only: bool = False,
+        spacing: float | None = None,
     ) -> None:
         self.name = name
         self.azimuths = azimuths
         self.front_only = front_only
+        self.spacing = spacing
         self._responses = responses
         self._rate = sample_rate
         self._filters: dict[float, HeadFilters] = {}  # by sample rate; replaced, not modified: threads may share it
@@ -86,6 +93,31 @@ class Head:
         waves.
         """
         return cls("sphere", angles.grid(), None, _CUE_RATE)
+
+    @classmethod
+    def pair(cls, spacing: float) -> Head:
+        """Return two omnidirectional microphones at -90 and 90 degrees without a head between them.
+
+        Plane waves reach the microphones with equal levels and with a time difference of spacing / c * sin(azimuth),
+        where c is 343 m/s.
+
+        Parameters
+        ----------
+        spacing : float
+            Distance of the microphones in m, 0.01 to 1. Localization needs a delay, spacing / c, of at most
+            `cc_maxDelaySec`: 0.377 m by default.
+
+        Raises
+        ------
+        ValueError
+            For another spacing.
+        """
+        if not is_number(spacing) or not MIN_SPACING <= spacing <= MAX_SPACING:
+            raise ValueError(
+                f"spacing: expected a distance of the microphones from {MIN_SPACING:g} to {MAX_SPACING:g} m, "
+                f"got {short_repr(spacing)}"
+            )
+        return cls(f"{PREFIX}{spacing:g}", angles.grid(), None, _CUE_RATE, spacing=float(spacing))
 
     @classmethod
     def from_sofa(cls, path: str | os.PathLike[str], mirror: bool | None = None) -> Head:
@@ -140,7 +172,8 @@ class Head:
     @property
     def key(self) -> str:
         """A digest of the responses, equal for equal heads."""
-        digest = hashlib.sha256(f"{self._rate} {self._responses is None}".encode())
+        computed = "" if self._responses is not None else f"sphere {self.spacing}"
+        digest = hashlib.sha256(f"{self._rate} {computed}".encode())
         if self._responses is not None:
             digest.update(self.azimuths.tobytes())
             digest.update(np.ascontiguousarray(self._responses).tobytes())
@@ -157,6 +190,15 @@ class Head:
         swapped = self._responses[order][:, ::-1]
         return bool(np.sum((swapped - self._responses) ** 2) <= _SYMMETRY * np.sum(self._responses**2))
 
+    def check_delay(self, limit: float) -> None:
+        """Raise ValueError if the delay of a pair exceeds `cc_maxDelaySec`, the `limit` in s."""
+        if self.spacing is not None and self.spacing > limit * SPEED_OF_SOUND:
+            raise ValueError(
+                f"head: expected a spacing of at most {limit * SPEED_OF_SOUND:.3g} m, the way of sound in "
+                f"cc_maxDelaySec ({limit:g} s), got {self.spacing:g} m; raise cc_maxDelaySec to at least "
+                f"{math.ceil(self.spacing / SPEED_OF_SOUND * 1e5) / 1e5:g}, or use closer microphones"
+            )
+
     def filters(self, sample_rate: float) -> HeadFilters:
         """Return the filters at a sample rate (Hz)."""
         rate = checked_rate(sample_rate)
@@ -168,7 +210,7 @@ class Head:
 
     def _make_filters(self, sample_rate: float) -> HeadFilters:
         if self._responses is None:
-            return sphere_filters(sample_rate)
+            return sphere_filters(sample_rate) if self.spacing is None else pair_filters(self.spacing, sample_rate)
         ratio = Fraction(sample_rate / self._rate).limit_denominator(1000)
         responses = self._responses
         numbers = math.ceil(responses.size * ratio)
@@ -269,12 +311,28 @@ class Head:
         weights = (1 + distance**2) ** -4.0  # power response of a gammatone filter of order 4
         energies = np.einsum("aef,cf->eac", np.abs(at) ** 2, weights)
         size = 16 * filters.size
-        lags = np.arange(-int(_MAX_ITD * 16 * rate), int(_MAX_ITD * 16 * rate) + 1)
+        reach = int(max(_MAX_ITD, 1.1 * (self.spacing or 0.0) / SPEED_OF_SOUND) * 16 * rate)
+        lags = np.arange(-reach, reach + 1)
         cross = (at[:, 0] * np.conj(at[:, 1]))[:, np.newaxis] * weights
         itd = np.empty(cross.shape[:2])
         for row, spectrum in enumerate(cross):
             itd[row] = lags[np.fft.irfft(spectrum, size)[:, lags].argmax(axis=1)] / (16 * rate)
         return itd, 10 * np.log10(energies[1] / energies[0])
+
+
+def computed_head(name: str) -> Head | None:
+    """Return the head with a name, `sphere` or `pair:` and a spacing in m; None if the name is that of a file."""
+    if name == "sphere":
+        return Head.sphere()
+    if not name.startswith(PREFIX):
+        return None
+    try:
+        return Head.pair(float(name.removeprefix(PREFIX)))
+    except ValueError:
+        raise ValueError(
+            f"head: expected {PREFIX} and the distance of the microphones from {MIN_SPACING:g} to {MAX_SPACING:g} m, "
+            f"such as {PREFIX}0.058, got {short_repr(name)}"
+        ) from None
 
 
 def checked_rate(sample_rate: Any) -> float:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.head_check import HeadCheck
 from rosafe.localization.localizer import UPDATE_SECONDS, Localizer
 from rosafe.localization.tracker import Track
 
@@ -31,6 +32,8 @@ SILENCE_SECONDS = 0.5  # without new frames, in addition to a block, until no so
 TIME_SLACK = 0.1  # s by which the time of frames may go back, when the clock of the stream is fitted
 MAX_PAUSE = 2.0  # s between two frames; later ones begin again
 GAP_SECONDS = 0.5  # of lost frames after which localization begins again
+CHECK_SECONDS = 5.0  # between two reports on the head
+CHECK_BLOCKS = 50  # of 0.1 s with sound from one direction, for a report
 _MAX_INTERVALS = 100  # in which the robot speaks
 
 
@@ -323,15 +326,15 @@ class FrameQueue:
 
     Attributes
     ----------
-    received_at : float
-        When frames were added last (time.monotonic).
+    received_at, used_at : float
+        When frames were added and used last (time.monotonic).
     """
 
     def __init__(self, rotation: HeadRotation, mute: Mute) -> None:
         self._rotation = rotation
         self._mute = mute
         self._waiting: list[NewFrames] = []
-        self.received_at = 0.0
+        self.received_at = self.used_at = 0.0
 
     @property
     def muted(self) -> bool:
@@ -405,6 +408,45 @@ class Publishing(Protocol):
         """Publish the state at a clock time (s): the tracks, from their power to their level, grid and posterior."""
 
 
+class HeadReporter:
+    """Reports every few seconds whether the cues belong to the head.
+
+    Parameters
+    ----------
+    status : Status
+    """
+
+    def __init__(self, status: Status) -> None:
+        self._status = status
+        self._check: HeadCheck | None = None
+        self._due = 0.0
+
+    def begin(self, model: DirectionModel | None) -> None:
+        """Forget all sound; `model` is that of the head, None if there is none."""
+        self._check = HeadCheck(model) if model is not None else None
+        self._status.clear("head")
+
+    def add(self, frames: NewFrames) -> None:
+        """Check frames."""
+        if self._check is None:
+            return
+        self._check.update(frames.features)
+        if time.monotonic() >= self._due:
+            self._due = time.monotonic() + CHECK_SECONDS
+            report = self._check.report(CHECK_BLOCKS)
+            if report is not None and report.problem:
+                self._status.set("head", WARN, f"the cues do not fit the head: {report.problem}")
+            else:
+                self._status.clear("head")
+
+
+class _Callbacks(NamedTuple):
+    """Functions that the loop calls; see `LocalizationLoop`."""
+
+    suspicious: Callable[[], None]
+    updated: Callable[[float, Sequence[Track], float], None]
+
+
 class LocalizationLoop:
     """Localizes and publishes, on a thread of its own, from `start` to `close`.
 
@@ -419,6 +461,9 @@ class LocalizationLoop:
         Called if messages do not fit the processors that were requested.
     clock : callable
         Returns the clock time in s.
+    updated : callable
+        Called after each update of the tracks, with its clock time (s), the tracks, and the direction of the head
+        (degrees).
     """
 
     def __init__(
@@ -429,20 +474,21 @@ class LocalizationLoop:
         status: Status,
         suspicious: Callable[[], None],
         clock: Callable[[], float],
+        updated: Callable[[float, Sequence[Track], float], None] = lambda time, tracks, yaw: None,
     ) -> None:
         self._localizer_for = localizer_for
         self._publishing = publishing
         self._clock = clock
         self._queue = queue
         self._status = status
-        self._suspicious = suspicious
+        self._callbacks = _Callbacks(suspicious, updated)
         self._arrived = threading.Event()
         self._closing = False
         self._lock = threading.Lock()  # of the link
         self._source: FrameSource | None = None
         self._localizer: Localizer | None = None
+        self._head_report = HeadReporter(status)
         self._newest = 0.0  # end of the newest frame that was used, clock time in s; 0 before the first one
-        self._used_at = 0.0  # when it was used (time.monotonic)
         self._estimate: tuple[Any, Any] = angles.grid(), uniform(angles.grid())
         self._thread = threading.Thread(target=self._run, name="localization", daemon=True)
 
@@ -467,9 +513,10 @@ class LocalizationLoop:
         source = open_source(self._arrived.set) if open_source is not None else None
         with self._lock:
             before, self._source = self._source, source
-            self._used_at = self._queue.received_at = time.monotonic()
+            self._queue.used_at = self._queue.received_at = time.monotonic()
             self._begin_again()
             self._localizer = localizer
+            self._head_report.begin(model)
         if before is not None:
             before.close()
         if source is None:
@@ -533,7 +580,7 @@ class LocalizationLoop:
             return False
         if source.problem:
             self._status.set("frames", WARN, f"messages of rosAFE cannot be used: {source.problem}")
-            self._suspicious()
+            self._callbacks.suspicious()
         if new is not None:
             self._append(new, localizer)
         used = self._queue.take(least)
@@ -557,10 +604,12 @@ class LocalizationLoop:
             self._begin_again()
             return False
         self._status.clear("values")
+        self._head_report.add(used.frames)
         steady = ", ".join(f"{azimuth:.0f}" for azimuth in localizer.noise.azimuths)
         self._status.value("directions of steady noise (degrees)", steady or "none")
         self._estimate = result["azimuths"], result["posterior"][0]
-        self._newest, self._used_at = float(result["time"][0]), time.monotonic()
+        self._newest, self._queue.used_at = float(result["time"][0]), time.monotonic()
+        self._callbacks.updated(localizer.updated_at, localizer.sources, float(used.yaw[-1]))
         return True
 
     def _append(self, new: NewFrames, localizer: Localizer) -> None:
@@ -578,7 +627,7 @@ class LocalizationLoop:
         if source is None:
             return
         limit = self._limit(source)
-        if self._newest and (self._queue.muted or now - self._used_at > limit):
+        if self._newest and (self._queue.muted or now - self._queue.used_at > limit):
             self._begin_again()
         if now - self._queue.received_at <= limit:
             self._status.clear("frames")

@@ -16,7 +16,7 @@ from rosafe.dsp.numeric_limits import FloatArray, as_numbers
 from rosafe.localization import angles, cues
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.evidence import EvidenceWindow
-from rosafe.localization.head import Head, checked_rate
+from rosafe.localization.head import Head, checked_rate, computed_head
 from rosafe.localization.mixture import candidates
 from rosafe.localization.model_cache import model_of
 from rosafe.localization.noise import SteadyNoise
@@ -42,7 +42,8 @@ class Localizer(OwnState):
     sample_rate : float
         Of the sound, Hz.
     head : Head or DirectionModel or str or Path
-        `"sphere"`, a head, a model, or the path of a SOFA file or of a model that `rosafe head learn` has written.
+        `"sphere"`, `"pair:0.058"` (microphones with this spacing in m), a head, a model, or the path of a SOFA file
+        or of a model that `rosafe head learn` has written.
     seconds : float
         Length of the window of integration, at most 60 s.
     parameters : mapping, optional
@@ -131,6 +132,11 @@ class Localizer(OwnState):
         """The sources at the moment, those with a low probability included; `id` is 0 until one was present."""
         return self._tracker.tracks
 
+    @property
+    def updated_at(self) -> float:
+        """The time of the last update of `sources` in s, as `time` of `update`; -inf before the first one."""
+        return self._tracker.time
+
     def process(self, block: Any, head_yaw: Any = 0.0) -> dict[str, Any]:
         """Localize the next block of sound.
 
@@ -189,7 +195,7 @@ class Localizer(OwnState):
         if not (np.abs(times) <= angles.MAX_TIME).all():
             raise ValueError(f"time: expected finite times up to {angles.MAX_TIME:g} s, got {short_repr(times)}")
         yaw = yaw_at(head_yaw, times)
-        quantized = cues.quantize(arrays, self._gain_db)
+        quantized = cues.quantize(arrays, self._gain_db, self.model.max_itd)
         # Rows of contiguous memory: the order of a sum, and so its rounding, does not depend on the block length.
         power = (
             np.ascontiguousarray(arrays["ratemap"].transpose(2, 0, 1))
@@ -245,20 +251,34 @@ def find_model(
 ) -> DirectionModel:
     """Return the model for `Localizer`, learned if there is none yet; ValueError if an argument is unsuitable."""
     sample_rate = checked_rate(sample_rate)
+    if isinstance(head, (str, os.PathLike)):
+        head = open_head(head)
     if isinstance(head, DirectionModel):
         return _checked_model(head, sample_rate, parameters)
-    if isinstance(head, (str, os.PathLike)):
-        if head == "sphere":
-            head = SPHERE
-        elif os.fspath(head).lower().endswith(".sofa"):
-            head = Head.from_sofa(head)
-        else:
-            return _checked_model(DirectionModel.load(head), sample_rate, parameters)
     if not isinstance(head, Head):
         raise ValueError(
-            f"head: expected a Head, 'sphere' or the path of a SOFA file or a model, got {short_repr(head)}"
+            f"head: expected a Head, 'sphere', 'pair:SPACING' or the path of a SOFA file or a model, "
+            f"got {short_repr(head)}"
         )
     return model_of(head, sample_rate, parameters, progress)
+
+
+def open_head(name: str | os.PathLike[str], mirror: bool | None = None) -> Head | DirectionModel:
+    """Return a head by its name or file, or the model in a file; `mirror` is that of `Head.from_sofa`.
+
+    Raises
+    ------
+    ValueError
+        The name or the file is unsuitable: one line.
+    """
+    text = os.path.expanduser(os.fspath(name))
+    if text.lower().endswith(".sofa"):
+        return Head.from_sofa(text, mirror)
+    if mirror is not None:
+        raise ValueError(f"mirror: expected a SOFA file as the head, got {short_repr(text)}; unset mirror")
+    if text == "sphere":
+        return SPHERE
+    return computed_head(text) or DirectionModel.load(text)
 
 
 def _checked_model(model: DirectionModel, sample_rate: float, parameters: Mapping[str, Any] | None) -> DirectionModel:

@@ -17,11 +17,11 @@ from rosafe.dsp import kernels
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 
-SHARPNESS = 2.0  # factor of the evidence: makes the weights sparse
+SHARPNESS = 1.0  # factor of the evidence: makes the weights sparse
 ITERATIONS = 20
-MIN_SHARE = 0.1  # of the evidence in a window, of a candidate
+MIN_SHARE = 0.08  # of the evidence in a window, of a candidate
 MIN_UNITS = 60  # frames and channels with cues in a window
-MIN_SALIENCE = 0.08  # part of the evidence for a source that is above the noise, at least; less is noise
+MIN_SALIENCE = 0.19  # part of the evidence for a source that is above the noise, at least; less is noise
 MIN_REST = 0.4  # of the evidence, with which that of a source is compared if the rest is noise
 MAX_CANDIDATES = 6
 SEPARATION = 15.0  # degrees between two candidates, at least

@@ -9,13 +9,14 @@ import numpy as np
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 
-FRAME_WEIGHT = 0.2  # of the evidence of a frame in its channel: neighbouring frames are not independent
+FRAME_WEIGHT = 0.1  # of the evidence of a frame in its channel: neighbouring frames are not independent
 UNRELIABLE = 0.3  # probability that the cues of a channel do not depend on the direction of the source
 CHANNEL_WEIGHT = 0.2  # of the evidence of a channel: neighbouring channels are not independent
-# Logistic regression of the correctness of 21,600 estimates (windows of 0.25, 0.5 and 1 s of speech in white and
-# speech-shaped diffuse noise at 60 to -5 dB, MIT KEMAR): constant, log-odds of the posterior, evidence, length.
-CALIBRATION = np.array([0.507, 1.11, -0.222, -0.954])
-NO_DIRECTION = -0.012  # mean evidence for which noise without a direction is as likely as a source
+# Logistic regression of the correctness of 5,900 estimates (windows of 0.25, 0.5 and 1 s at 16 kHz; speech in diffuse
+# noise at 60 to -5 dB, training sounds in statistical rooms, and noise without a direction; MIT KEMAR): constant,
+# log-odds of the posterior, evidence, length; the mean evidence at which half remains, and its scale.
+CALIBRATION = np.array([2.775, 2.189, -0.889, -1.573])
+NO_DIRECTION, DIRECTION_SCALE = -0.105, 0.0435
 TOLERANCE = 5.0  # degrees; the confidence is the probability that the azimuth is right to within this
 _TIE = 1e-6  # directions whose scores differ by less are equal
 
@@ -100,5 +101,5 @@ def calibrate(mass: float, evidence: float, units: int) -> float:
     mean = evidence / units
     odds = np.clip(np.log(max(mass, 1e-9) / max(1 - mass, 1e-9)), -5.0, 8.0)
     features = np.array([1.0, odds, np.arcsinh(max(mean, 0.0) / 0.03), np.log(units / 3100)])
-    directional = 1 / (1 + np.exp(-(mean - NO_DIRECTION) / 0.008))
+    directional = 1 / (1 + np.exp(-(mean - NO_DIRECTION) / DIRECTION_SCALE))
     return float(directional / (1 + np.exp(-CALIBRATION @ features)))

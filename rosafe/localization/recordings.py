@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+import scipy.signal
 
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles, training
@@ -16,6 +17,7 @@ from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.head import checked_rate
 from rosafe.localization.horizontal_plane import MAX_GAP
 from rosafe.localization.results import read_recordings
+from rosafe.localization.rooms import DIRECTIONS
 from rosafe.localization.training import Progress
 from rosafe.processing.sounds import open_sound
 from rosafe.system.terminal import printable
@@ -24,6 +26,7 @@ from rosafe.tree.sizes import refuse_over_available
 MAX_SECONDS = 60.0  # of sound that is used for a direction
 MAX_FRAMES = 2**22  # of a direction
 MIN_SECONDS = 1.0
+_REACH = 0.003  # s, of a response before and after its middle
 _MIXED = 24  # pieces of recordings from other directions that make a diffuse noise
 
 
@@ -35,7 +38,8 @@ def learn_recordings(
 ) -> DirectionModel:
     """Learn a model from the recordings that a CSV file lists in the columns `file` and `azimuth_deg`.
 
-    The sounds of all directions together, mixed at random, are the diffuse noise of training. The evidence for
+    The sounds of all directions together, mixed at random, are the diffuse noise of training. Half of the sounds get
+    the reverberation of a room, as those of `learn_head`: recordings need no room themselves. The evidence for
     directions of the grid between two recorded ones is interpolated.
 
     Parameters
@@ -80,7 +84,7 @@ def learn_recordings(
     histograms, description = training.count(
         _sounds(recorded, sample_rate, progress), sample_rate, parameters, azimuths, f"recordings {os.fspath(path)}"
     )
-    itd, ild = (_interpolated(table, azimuths) for table in histograms.tables())
+    itd, ild = (_interpolated(table, azimuths) for table in histograms.tables(description["parameters"]["fb_cfHz"]))
     return DirectionModel({**description, "is_sphere": False}, itd, ild)
 
 
@@ -103,12 +107,18 @@ def _check(recorded: Mapping[float, FloatArray], sample_rate: float, name: str) 
 def _sounds(
     recorded: Mapping[float, FloatArray], sample_rate: float, progress: Progress | None
 ) -> Iterator[tuple[float, FloatArray]]:
-    """Return each recording at each signal-to-noise ratio."""
+    """Return each recording at each signal-to-noise ratio, without a room and in one: a half of it each."""
     random = np.random.default_rng(1)
     everything = list(recorded.values())
-    for number, (azimuth, sound) in enumerate(recorded.items()):
-        count = sound.shape[1]
-        for snr in training.SNR_DB:
+    rooms = training.room_pool(_responses(recorded, sample_rate), sample_rate, random)
+    for number, (azimuth, whole) in enumerate(recorded.items()):
+        for index, snr in enumerate(training.SNR_DB + training.ROOM_SNR_DB):
+            half = whole.shape[1] // 2
+            sound = whole[:, :half] if index % 2 else whole[:, half:]
+            count = sound.shape[1]
+            if index >= len(training.SNR_DB):
+                near = sound[np.sum(sound**2, axis=1).argmax()]
+                sound = training.in_room(sound, near, rooms[random.integers(len(rooms))])
             noise = np.zeros((2, count))
             for _ in range(_MIXED):
                 other = everything[random.integers(len(everything))]
@@ -116,6 +126,26 @@ def _sounds(
             yield azimuth, sound + _normalized(noise) * 10 ** (-snr / 20)
         if progress:
             progress((number + 1) / (len(recorded) + 1))
+
+
+def _responses(recorded: Mapping[float, FloatArray], sample_rate: float) -> FloatArray:
+    """Return responses (D, 2, N) of directions around the head, relative to the louder ear.
+
+    The response of the other ear is the Wiener filter that estimates it from the louder one.
+    """
+    length = 2 * round(_REACH * sample_rate)
+    azimuths = np.array(list(recorded))
+    found = np.zeros((DIRECTIONS, 2, length))
+    for number, azimuth in enumerate(np.arange(DIRECTIONS) * 360 / DIRECTIONS):
+        sound = recorded[float(azimuths[np.abs(angles.difference(azimuths, azimuth)).argmin()])]
+        near = int(np.sum(sound**2, axis=1).argmax())
+        size = {"fs": sample_rate, "nperseg": 4 * length}
+        cross = scipy.signal.csd(sound[near], sound[1 - near], **size)[1]
+        power = scipy.signal.welch(sound[near], **size)[1]
+        other = np.fft.irfft(cross / (power + 1e-3 * power.max()))
+        found[number, near, length // 2] = 1.0
+        found[number, 1 - near] = np.roll(other, length // 2)[:length] * np.hanning(length)
+    return found
 
 
 def _interpolated(table: np.ndarray, azimuths: FloatArray) -> np.ndarray:

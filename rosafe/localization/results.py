@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import os
 from collections.abc import Iterator, Mapping
 from io import TextIOWrapper
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rosafe.declarations.text import short_repr
 from rosafe.localization import angles
+from rosafe.localization.streams import RATE
 from rosafe.system.input import open_regular
 from rosafe.system.terminal import printable
 
@@ -33,15 +36,44 @@ def estimates_csv(result: Mapping[str, Any]) -> str:
 
 
 def tracks_csv(result: Mapping[str, Any]) -> str:
-    """Return one line for each source and time: `id, time_s, azimuth_deg, azimuth_std_deg, probability`."""
-    lines = ["id,time_s,azimuth_deg,azimuth_std_deg,probability"]
+    """Return one line for each source and time: `id, time_s, azimuth_deg, azimuth_std_deg, probability`, and `speech`.
+
+    The last column is present if streams were computed.
+    """
+    with_speech = any("speech" in track for track in result["tracks"])
+    lines = ["id,time_s,azimuth_deg,azimuth_std_deg,probability" + (",speech" if with_speech else "")]
     for track in result["tracks"]:
-        columns = (track["time"], track["azimuth"], track["azimuth_std"], track["probability"])
-        lines += [
-            f"{track['id']},{time:.3f},{azimuth:.1f},{std:.1f},{probability:.4f}"
-            for time, azimuth, std, probability in zip(*columns, strict=True)
-        ]
+        columns = [track["time"], track["azimuth"], track["azimuth_std"], track["probability"]]
+        layout = "{:.3f},{:.1f},{:.1f},{:.4f}"
+        if with_speech:
+            columns.append(track["speech"])
+            layout += ",{:.4f}"
+        lines += [f"{track['id']}," + layout.format(*values) for values in zip(*columns, strict=True)]
     return "\n".join(lines) + "\n"
+
+
+def stream_files(result: Mapping[str, Any], folder: Path) -> dict[Path, bytes]:
+    """Return a WAV file for each track with a stream, and `streams.csv`: `file, id, start_s, azimuth_deg, speech`.
+
+    The azimuth is that at the start, and the speech the mean probability, `nan` if it is unknown.
+    """
+    import soundfile
+
+    files: dict[Path, bytes] = {}
+    lines = ["file,id,start_s,azimuth_deg,speech"]
+    for track in result["tracks"]:
+        if not len(track["stream"]):
+            continue
+        name = f"source-{track['id']}.wav"
+        with io.BytesIO() as file:
+            soundfile.write(file, track["stream"], RATE, format="WAV", subtype="PCM_16")
+            files[folder / name] = file.getvalue()
+        start = track["stream_time"]
+        azimuth = track["azimuth"][min(np.searchsorted(track["time"], start), len(track["time"]) - 1)]
+        known = track["speech"][np.isfinite(track["speech"])]
+        speech = float(known.mean()) if len(known) else math.nan
+        lines.append(f"{name},{track['id']},{start:.3f},{azimuth:.1f},{speech:.4f}")
+    return {**files, folder / "streams.csv": ("\n".join(lines) + "\n").encode()}
 
 
 def as_json(result: Mapping[str, Any]) -> str:
@@ -64,6 +96,7 @@ def as_json(result: Mapping[str, Any]) -> str:
                 "azimuth_deg": numbers(track["azimuth"], 1),
                 "azimuth_std_deg": numbers(track["azimuth_std"], 1),
                 "probability": numbers(track["probability"], 4),
+                **({"speech": numbers(track["speech"], 4)} if "speech" in track else {}),
             }
             for track in result["tracks"]
         ],

@@ -18,10 +18,13 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 from rosafe.localization.filters import HOP, HeadFilters, SourceRenderer
 from rosafe.localization.head import Head
-from rosafe.localization.scene_signals import SourceSignal
+from rosafe.localization.rectangular_room import RectangularRoom, RoomReflections
+from rosafe.localization.reverberation import Reverberation
+from rosafe.localization.scene_signals import SourceSignal, uniform
 
 BLOCK = 16 * HOP  # frames that are computed at a time
 NOISE_SOURCES = 36  # independent sources of the diffuse noise, at equal distances around the head
+DEFAULT_DISTANCE = 1.5  # m
 TRUTH_SECONDS = 0.01  # between two lines of a truth file
 TRUTH_HEADER = "time_s,head_yaw_deg,name,azimuth_deg"
 
@@ -62,6 +65,8 @@ class SourceDescription:
         RMS in dB full scale, before the head.
     start, end : float
         When it sounds, s.
+    distance : float
+        From the head, m. It changes the reflections only: `level_db` is the level of the direct sound at the head.
     """
 
     name: str
@@ -70,6 +75,7 @@ class SourceDescription:
     level_db: float = -30.0
     start: float = 0.0
     end: float = float("inf")
+    distance: float = DEFAULT_DISTANCE
 
     def end_at(self, sample_rate: float) -> float:
         """Return when it ends (s): a sound without a loop ends before `end`."""
@@ -97,6 +103,8 @@ class SceneDescription:
         s; None without an end.
     seed : int
         Of all random numbers.
+    room : RectangularRoom or None
+        The room around them; None without reflections.
     """
 
     sample_rate: int
@@ -106,12 +114,20 @@ class SceneDescription:
     snr_db: float | None = None
     duration: float | None = None
     seed: int = 0
+    room: RectangularRoom | None = None
 
     def __post_init__(self) -> None:
-        """Raise ValueError if a source is behind a head that covers the front half only."""
-        if not self.head.front_only:
-            return
-        for source in self.sources:
+        """Raise ValueError if a source is outside the room, or behind a head that covers the front half only."""
+        if self.room is not None and self.room.drr_db is None:
+            for source in self.sources:
+                values = source.azimuth.at(np.array(source.azimuth.times))
+                course = np.arange(values.min(), min(values.max(), values.min() + 360) + 1)
+                if source.distance > (largest := self.room.largest_distance(course)):
+                    raise ValueError(
+                        f"{source.name}: distance: expected at most {largest:g} m in this room, "
+                        f"got {source.distance:g}; set the distance of the source, or a larger room"
+                    )
+        for source in self.sources if self.head.front_only else ():
             times = np.unique((*source.azimuth.times, *self.head_yaw.times))
             relative = source.azimuth.at(times) - self.head_yaw.at(times)
             self.head.check_azimuths(relative)
@@ -155,6 +171,11 @@ class SceneRenderer(OwnState):
         filters = scene.head.filters(scene.sample_rate)
         self._sources = [(source, SourceRenderer(filters)) for source in scene.sources]
         self._noise = None if scene.snr_db is None else _noise_of(scene, filters)
+        self._reverberation = None
+        if scene.room is not None:
+            distances = [DEFAULT_DISTANCE if scene.room.drr_db is not None else s.distance for s in scene.sources]
+            reflections = RoomReflections(scene.room, filters, scene.sample_rate, scene.seed)
+            self._reverberation = Reverberation(reflections, distances, BLOCK)
         self._frame = 0  # the first one of the next block
         self._rest = np.zeros((2, 0))
 
@@ -176,7 +197,7 @@ class SceneRenderer(OwnState):
         hops = (first + np.arange(0, BLOCK + 1, HOP)) / rate
         yaw = self.scene.head_yaw.at(hops)
         total = np.zeros((2, BLOCK)) if self._noise is None else self._noise.block()
-        for source, renderer in self._sources:
+        for number, (source, renderer) in enumerate(self._sources):
             begin = round(source.start * rate)
             end = min(begin + source.signal.frames, source.end * rate)
             if first + BLOCK <= begin or first >= end + 2 * rate:  # silent, the tail of the last response included
@@ -186,7 +207,12 @@ class SceneRenderer(OwnState):
             count = inside.stop - inside.start
             if count > 0:
                 samples[inside] = source.signal.samples(max(0, first - begin), count) * 10 ** (source.level_db / 20)
-            total += renderer.process(samples, angles.wrap(source.azimuth.at(hops) - yaw))
+            azimuths = source.azimuth.at(hops)
+            total += renderer.process(samples, angles.wrap(azimuths - yaw))
+            if self._reverberation:
+                total += self._reverberation.add(number, samples, azimuths, yaw)
+        if self._reverberation:
+            total += self._reverberation.tail()
         return total
 
 
@@ -226,8 +252,3 @@ class DiffuseNoise:
         self._tail = np.zeros_like(total)
         self._tail[:, : self._size - BLOCK] = total[:, BLOCK:]
         return np.asarray(total[:, :BLOCK])
-
-
-def uniform(random: np.random.PCG64, count: int) -> FloatArray:
-    """Return `count` uniform random numbers from -1 to 1, the same in every version of numpy."""
-    return np.asarray((random.random_raw(count) >> np.uint64(11)) * 2.0**-52 - 1.0)

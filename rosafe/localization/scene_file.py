@@ -10,8 +10,17 @@ from typing import Any
 
 from rosafe.audio.files.audiofile import AudioFileError
 from rosafe.declarations.text import short_repr
-from rosafe.localization.head import Head
-from rosafe.localization.scene import Course, SceneDescription, SourceDescription
+from rosafe.localization.head import Head, computed_head
+from rosafe.localization.rectangular_room import (
+    MAX_DRR,
+    MAX_RT60,
+    MAX_SIDE,
+    MIN_DRR,
+    MIN_RT60,
+    MIN_SIDE,
+    RectangularRoom,
+)
+from rosafe.localization.scene import DEFAULT_DISTANCE, Course, SceneDescription, SourceDescription
 from rosafe.localization.scene_signals import (
     MAX_FILE_FRAMES,
     FileSignal,
@@ -20,9 +29,9 @@ from rosafe.localization.scene_signals import (
     ToneSignal,
     VowelSignal,
 )
-from rosafe.setups.markup import SetupError, YamlNode, parse
 from rosafe.system.input import read_regular
 from rosafe.system.terminal import printable
+from rosafe.tree.setups.markup import SetupError, YamlNode, parse
 
 SUFFIXES = (".yaml", ".yml")
 MAX_BYTES = 1 << 18
@@ -30,13 +39,14 @@ MAX_VALUES = 45_000  # 10,000 points have 40,000
 MAX_SOURCES = 32
 MAX_POINTS = 10_000
 MAX_DURATION = 86_400.0  # s
+MIN_DISTANCE, MAX_DISTANCE = 0.2, 30.0  # m
 MIN_RATE, MAX_RATE = 8000, 192_000  # Hz
 DEFAULT_RATE = 44100
 DEFAULT_LEVEL_DB = -30.0
 _SIGNALS = ("noise", "tone", "vowel")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,63}")
-_SCENE = ("sample_rate", "duration", "seed", "head", "head_yaw", "noise", "sources")
-_SOURCE = ("name", "file", "signal", "frequency", "loop", "level_db", "azimuth", "start", "end")
+_SCENE = ("sample_rate", "duration", "seed", "head", "head_yaw", "noise", "room", "sources")
+_SOURCE = ("name", "file", "signal", "frequency", "loop", "level_db", "azimuth", "distance", "start", "end")
 
 
 class SceneError(ValueError):
@@ -114,6 +124,7 @@ class _SceneReader:
             head=value("head", self._head, None) or Head.sphere(),
             head_yaw=value("head_yaw", _course, Course()),
             snr_db=value("noise", _noise, None),
+            room=value("room", self._room, None),
             sources=self._sources(sources.items),
         )
 
@@ -129,12 +140,33 @@ class _SceneReader:
             values = {name: value for name, _, value in node.members(what, ("file", "mirror"))}
             mirror = _flag(values["mirror"], f"{what}: mirror") if "mirror" in values else None
             node, what = values.get("file", YamlNode(node.line)), f"{what}: file"
-        if node.scalar(what) == "sphere":
-            return Head.sphere()
+        try:
+            if (computed := computed_head(node.scalar(what))) is not None:
+                return computed
+        except ValueError as problem:
+            raise SetupError(node.line, str(problem)) from None
         path = self._path(node, what)
         if not path.lower().endswith(".sofa"):
-            raise SetupError(node.line, f"{what}: expected 'sphere' or a file that ends in .sofa")
+            raise SetupError(node.line, f"{what}: expected 'sphere', 'pair:SPACING' or a file that ends in .sofa")
         return Head.from_sofa(path, mirror)
+
+    def _room(self, node: YamlNode, what: str) -> RectangularRoom:
+        values = {name: value for name, _, value in node.members(what, ("size", "rt60", "drr_db"))}
+        if "rt60" not in values or ("size" in values) == ("drr_db" in values):
+            raise SetupError(
+                node.line, f"{what}: expected rt60, and either size or drr_db, got {short_repr([*values])}"
+            )
+        rt60 = _number(MIN_RT60, MAX_RT60)(values["rt60"], f"{what}: rt60")
+        if "drr_db" in values:
+            return RectangularRoom.drawn(
+                rt60, _number(MIN_DRR, MAX_DRR)(values["drr_db"], f"{what}: drr_db"), self._seed
+            )
+        size = values["size"].items or (values["size"],)
+        sides = tuple(_number(MIN_SIDE, MAX_SIDE)(side, f"{what}: size") for side in size)
+        try:
+            return RectangularRoom(sides, rt60)
+        except ValueError as problem:
+            raise SetupError(node.line, f"{what}: {problem}") from None
 
     def _sources(self, nodes: tuple[YamlNode, ...]) -> tuple[SourceDescription, ...]:
         sources: dict[str, SourceDescription] = {}
@@ -170,6 +202,7 @@ class _SceneReader:
             level_db=value("level_db", _number(-120, 0), DEFAULT_LEVEL_DB),
             start=start,
             end=end,
+            distance=value("distance", _number(MIN_DISTANCE, MAX_DISTANCE), DEFAULT_DISTANCE),
         )
 
     def _signal(

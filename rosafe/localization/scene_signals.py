@@ -100,8 +100,7 @@ class NoiseSignal:
         """See `SourceSignal`."""
         random = np.random.PCG64(list(self._seed))
         random.advance(begin)
-        raw = (random.random_raw(count) >> np.uint64(11)) * 2.0**-52 - 1.0
-        return np.sqrt(3.0) * raw * _ramp(begin, count, self._ramp)
+        return np.sqrt(3.0) * uniform(random, count) * _ramp(begin, count, self._ramp)
 
 
 class ToneSignal:
@@ -148,3 +147,8 @@ def _ramp(begin: int, count: int, length: float) -> FloatArray:
     if begin >= length:
         return np.ones(count)
     return np.minimum(1.0, (begin + np.arange(count)) / length)
+
+
+def uniform(random: np.random.PCG64, count: int) -> FloatArray:
+    """Return `count` uniform random numbers from -1 to 1, the same in every version of numpy."""
+    return np.asarray((random.random_raw(count) >> np.uint64(11)) * 2.0**-52 - 1.0)

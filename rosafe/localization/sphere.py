@@ -16,9 +16,9 @@ from rosafe.localization.filters import HeadFilters
 HEAD_RADIUS = 0.0875  # m
 SPEED_OF_SOUND = 343.0  # m/s
 HEAD_TIME = HEAD_RADIUS / SPEED_OF_SOUND  # s
-_RINGING = 40  # samples before the earliest arrival and at the end: that of the band limit is below -60 dB there
+RINGING = 40  # samples before the earliest arrival and at the end: that of the band limit is below -60 dB there
 _DECAY_SECONDS = 0.003  # from the earliest arrival until the response has decayed by 100 dB
-_SPACING = 1.0  # degrees between the responses of `sphere_filters`: near the bright spot they change fast
+_SPACING = 1.0  # degrees between `directions`: near the bright spot responses change fast
 _BAND_EDGE = 0.45  # of the sample rate: a raised cosine from here to 0.5 limits ringing
 
 
@@ -58,26 +58,36 @@ def sphere_spectra(frequencies: FloatArray, cosines: FloatArray) -> np.ndarray:
 def sphere_responses(azimuths: FloatArray, sample_rate: float) -> FloatArray:
     """Return the impulse responses (A, 2, N) of ears at 90 and -90 degrees for `azimuths` (A,) in degrees.
 
-    An impulse would arrive at the centre of the head after `_RINGING` samples and `HEAD_TIME`. Responses for azimuths
+    An impulse would arrive at the centre of the head after `RINGING` samples and `HEAD_TIME`. Responses for azimuths
     with equal lateral angles are equal to the last bit.
     """
-    length = 2 * _RINGING + int(np.ceil(_DECAY_SECONDS * sample_rate))
+    length = 2 * RINGING + int(np.ceil(_DECAY_SECONDS * sample_rate))
     size = scipy.fft.next_fast_len(4 * length, real=True)  # nothing is wrapped around
     frequencies = np.fft.rfftfreq(size, 1 / sample_rate)
     lateral = np.round(angles.lateral(azimuths), 9)
     lateral, rows = np.unique((lateral, -lateral), return_inverse=True)  # of the left and the right ear
-    delay = HEAD_TIME + _RINGING / sample_rate
-    edge = np.clip((frequencies / sample_rate - _BAND_EDGE) / (0.5 - _BAND_EDGE), 0.0, 1.0)
-    band = (0.5 + 0.5 * np.cos(np.pi * edge)) * np.exp(-2j * np.pi * frequencies * delay)
+    delay = HEAD_TIME + RINGING / sample_rate
+    band = band_limit(frequencies / sample_rate) * np.exp(-2j * np.pi * frequencies * delay)
     spectra = sphere_spectra(frequencies, np.sin(np.radians(lateral))) * band
     return np.fft.irfft(spectra, size)[rows.reshape(2, -1).T, :length]
 
 
+def band_limit(frequencies: FloatArray) -> FloatArray:
+    """Return the gains at `frequencies` (F,), relative to the sample rate, that limit the ringing of responses."""
+    edge = np.clip((frequencies - _BAND_EDGE) / (0.5 - _BAND_EDGE), 0.0, 1.0)
+    return np.asarray(0.5 + 0.5 * np.cos(np.pi * edge))
+
+
+def directions() -> FloatArray:
+    """Return the azimuths (A,) in degrees for which the responses of computed heads are stored."""
+    return np.arange(-180.0 + _SPACING, 180.0 + _SPACING / 2, _SPACING)
+
+
 def sphere_filters(sample_rate: float) -> HeadFilters:
     """Return the filters of the sphere for all directions."""
-    azimuths = np.arange(-180.0 + _SPACING, 180.0 + _SPACING / 2, _SPACING)
+    azimuths = directions()
     lateral = np.radians(angles.lateral(azimuths))
     incidence = np.stack((np.pi / 2 - lateral, np.pi / 2 + lateral), axis=1)
     path = np.where(incidence < np.pi / 2, 1 - np.cos(incidence), 1 + incidence - np.pi / 2)  # Woodworth's
-    delays = path * HEAD_TIME * sample_rate + _RINGING
+    delays = path * HEAD_TIME * sample_rate + RINGING
     return HeadFilters(azimuths, sphere_responses(azimuths, sample_rate), delays)

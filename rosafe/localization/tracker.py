@@ -24,9 +24,9 @@ GATE = 15.0  # degrees between a track and its candidate, at most
 _MEASUREMENT_STD = 3.0  # degrees, of a candidate
 _VELOCITY_STD = 15.0  # degrees/s, of a new track
 _ACCELERATION_STD = 8.0  # degrees/s per square root of a second
-_NEW_SHARE = 0.15  # of a candidate of a source that is not known yet; noise without a direction gives smaller peaks
-_IMAGE_SHARE = 0.25  # of a candidate at the front-back image of a source with more evidence
-_IMAGE_WIDTH = 6.0  # degrees of lateral angle between a source and its image, at most
+_NEW_SHARE = 0.12  # of a candidate of a source that is not known yet; noise without a direction gives smaller peaks
+_IMAGE_SHARE = 0.28  # of a candidate at the front-back image of a source with more evidence
+_IMAGE_WIDTH = 7.5  # degrees of lateral angle between a source and its image, at most
 _IMAGE_RATIO = 0.5  # mean share of an image, at least, relative to that of the source
 _BIRTH = -2.0  # log-odds of a new track
 _MAX_LOG_ODDS = 2.2
@@ -142,21 +142,23 @@ class Tracker:
         Those that are not forgotten; a source is present if its probability is above `PRESENT`.
     finished : list of Track
         Those that were present once and are forgotten now, if `keep` was set.
+    time : float
+        Of the last update, s; -inf before the first one.
     """
 
     def __init__(self, keep: bool = True) -> None:
         self.tracks: list[Track] = []
         self.finished: list[Track] = []
         self._keep = keep
-        self._time: float | None = None
+        self.time = -math.inf
         self._next_id = 1
 
     def update(self, candidates: Sequence[Candidate], time: float, yaw: float = 0.0) -> None:
         """Take the candidates of the time `time` (s), which must ascend; `yaw` (degrees) is that of the head."""
         for track in self.tracks:
-            track.predict(0.0 if self._time is None else time - self._time)
+            track.predict(time - self.time)
             track.follow(yaw)
-        self._time = time
+        self.time = time
         matched = self._assign(candidates)
         shares = [0.0] * len(self.tracks)  # evidence for each track
         for index, track in enumerate(self.tracks):

@@ -1,4 +1,4 @@
-"""Learn a direction model: from a head, with synthetic sounds in diffuse noise, or from recordings.
+"""Learn a direction model: from a head, with synthetic sounds in diffuse noise and in rooms, or from recordings.
 
 Multi-condition training follows T. May, S. van de Par and A. Kohlrausch (2011) and N. Ma, T. May and G. J. Brown
 (2017), "Exploiting deep neural networks and head movements for robust binaural localization of multiple sources in
@@ -18,14 +18,20 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles, cues
 from rosafe.localization.direction_model import DirectionModel, Histograms
 from rosafe.localization.head import Head
+from rosafe.localization.hum import hum_sounds
+from rosafe.localization.rooms import reverberation, surround
 from rosafe.processing.process import process
 
-SNR_DB = (30.0, 20.0, 12.0, 6.0, 2.0, -2.0, -6.0)
+SNR_DB = (30.0, 20.0, 12.0, 6.0, 2.0, -2.0, -6.0)  # of sounds without a room
+ROOM_SNR_DB = (40.0, 30.0, 30.0, 20.0, 20.0, 12.0, 6.0)  # of sounds in rooms
+ROOMS = 48
+RT60 = 0.15, 1.0  # s, of the rooms
+DRR_DB = -8.0, 10.0  # direct-to-reverberant ratio of the rooms
 # Noise without modulation, whose level is near its floor although nothing disturbs it: a small part of the sounds, as
 # most sounds near their floor are disturbed.
 STEADY_SNR_DB = 40.0
 STEADY_PART, MIN_STEADY_SECONDS = 0.1, 0.1  # of the length of another sound; at least
-SOUND_SECONDS = 1000.0  # of all directions and SNRs together
+SOUND_SECONDS = 1600.0  # of all directions and SNRs together
 NOISE_SECONDS = 12.0
 NOISE_SOURCES = 36
 _SKIP_SECONDS = 0.05  # at the beginning of a sound, until the filters have settled
@@ -50,6 +56,7 @@ def learn_head(
     progress : callable, optional
         Called with the part that is done, from 0 to 1.
     """
+    head.check_delay(cues.describe(sample_rate, parameters)["parameters"]["cc_maxDelaySec"])
     filters = head.filters(sample_rate)
     directions = angles.grid()
     symmetric = head.is_symmetric()
@@ -59,30 +66,33 @@ def learn_head(
         directions = directions[directions <= 90]
     random = np.random.default_rng(1)
     noises = _noise_pool(lambda azimuth: filters.response(azimuth), sample_rate, random)
-    seconds = SOUND_SECONDS / (len(directions) * len(SNR_DB))
+    rooms = room_pool(surround(head, sample_rate), sample_rate, random)
+    seconds = SOUND_SECONDS / (len(directions) * len(SNR_DB + ROOM_SNR_DB))
     length = scipy.fft.next_fast_len(round((seconds + _SKIP_SECONDS) * sample_rate), real=True)
     steady_length = max(round(STEADY_PART * length), round(MIN_STEADY_SECONDS * sample_rate))
 
     def sounds() -> Iterator[tuple[float, FloatArray]]:
         for number, azimuth in enumerate(directions):
-            response = filters.response(float(azimuth))[:, np.newaxis]
-            dry = np.stack(
-                [
-                    *(_training_sound(number + index, length, sample_rate, random) for index in range(len(SNR_DB))),
-                    random.standard_normal(length),
-                ]
-            )
-            wet = scipy.signal.oaconvolve(dry[np.newaxis], response, axes=-1)[..., :length]
-            for index, snr in enumerate((*SNR_DB, STEADY_SNR_DB)):
+            direct = filters.response(float(azimuth))
+            for index, snr in enumerate((*SNR_DB, *ROOM_SNR_DB, STEADY_SNR_DB)):
+                steady = index == len(SNR_DB + ROOM_SNR_DB)
+                dry = (
+                    random.standard_normal(length)
+                    if steady
+                    else _training_sound(number + index, length, sample_rate, random)
+                )
+                sound = scipy.signal.oaconvolve(dry[np.newaxis], direct, axes=-1)[:, :length]
+                if not steady and index >= len(SNR_DB):
+                    sound = in_room(sound, dry, rooms[random.integers(ROOMS)])
                 noise = noises[(number + index) % 2]
-                count = length if index < len(SNR_DB) else min(length, steady_length)
+                count = min(length, steady_length) if steady else length
                 begin = random.integers(noise.shape[1] - count)
-                yield float(azimuth), wet[:, index, :count] + noise[:, begin : begin + count] * 10 ** (-snr / 20)
+                yield float(azimuth), sound[:, :count] + noise[:, begin : begin + count] * 10 ** (-snr / 20)
             if progress:
                 progress((number + 1) / (len(directions) + 1))
 
     grid = angles.grid()
-    histograms, description = count(sounds(), sample_rate, parameters, grid, head.key)
+    histograms, description = count(sounds(), sample_rate, parameters, grid, head.key, cues.max_itd(head.spacing))
     if head.front_back_equal:
         behind = np.abs(grid) > 90
         source = _indices(grid, np.where(grid >= 0, 180 - grid, -180 - grid))
@@ -92,7 +102,9 @@ def learn_head(
         poles = _indices(grid, np.array([0.0, 180.0]))
         for counts in (histograms.itd, histograms.ild):
             counts[poles] = counts[poles].sum(axis=0)
-    return DirectionModel({**description, "is_sphere": head.front_back_equal}, *histograms.tables())
+    return DirectionModel(
+        {**description, "is_sphere": head.front_back_equal}, *histograms.tables(description["parameters"]["fb_cfHz"])
+    )
 
 
 def count(
@@ -101,6 +113,7 @@ def count(
     parameters: Mapping[str, Any] | None,
     azimuths: FloatArray,
     key: str,
+    max_itd: float = cues.MAX_ITD,
 ) -> tuple[Histograms, dict[str, Any]]:
     """Count the cues of sounds, pairs of one of `azimuths` and both ears (2, n) with a power of 1 before the head.
 
@@ -114,14 +127,18 @@ def count(
     for azimuth, sound in sounds:
         scaled = sound * _LEVEL
         features = process(scaled, sample_rate, parameters=values, outputs=list(cues.KINDS))
-        quantized = cues.quantize(features, cues.scaling_db(values))
+        quantized = cues.quantize(features, cues.scaling_db(values), max_itd)
         direction = int(np.abs(angles.difference(azimuths, azimuth)).argmin())
         histograms.add(direction, quantized.select(slice(skip, None)))
         powers += np.mean(scaled**2), features["ratemap"].sum(axis=(0, 1)).mean()
+    for sound in hum_sounds(sample_rate):
+        features = process(sound * _LEVEL, sample_rate, parameters=values, outputs=list(cues.KINDS))
+        histograms.add_hum(cues.quantize(features, cues.scaling_db(values), max_itd).select(slice(skip, None)))
     return histograms, {
         "sample_rate": sample_rate,
         "parameters": values,
         "head": key,
+        "max_itd": max_itd,
         "level_gain_db": float(10 * np.log10(powers[0] / powers[1])),
     }
 
@@ -131,6 +148,24 @@ def _indices(grid: FloatArray, azimuths: FloatArray) -> np.ndarray:
 
 
 # --- sounds ---
+
+
+def room_pool(responses: FloatArray, sample_rate: float, random: np.random.Generator) -> list[tuple[FloatArray, float]]:
+    """Return the reverberation (2, n) of rooms and its energy relative to the direct sound.
+
+    `responses` (D, 2, N) are those of directions around the head.
+    """
+    pool = []
+    for _ in range(ROOMS):
+        rt60, drr_db = float(np.exp(random.uniform(*np.log(RT60)))), random.uniform(*DRR_DB)
+        pool.append((reverberation(responses, sample_rate, rt60, drr_db, random), 10 ** (-drr_db / 10)))
+    return pool
+
+
+def in_room(direct: FloatArray, dry: FloatArray, room: tuple[FloatArray, float]) -> FloatArray:
+    """Return the direct sound (2, n) of both ears with the reverberation that a `dry` sound (n,) has in a room."""
+    late = scipy.signal.oaconvolve(dry[np.newaxis], room[0], axes=-1)[:, : len(dry)]
+    return np.asarray(direct + late * np.sqrt(room[1] * np.sum(direct**2) / max(float(np.sum(late**2)), 1e-300)))
 
 
 def _noise_pool(

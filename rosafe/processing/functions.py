@@ -12,7 +12,7 @@ from rosafe.declarations.text import short_repr
 from rosafe.interface import KINDS, functions
 from rosafe.processing.process import process
 from rosafe.results.result import Result
-from rosafe.view.coordinates import EARS, axis_coordinates
+from rosafe.results.view.coordinates import EARS, axis_coordinates
 
 
 class RepresentationArray(np.ndarray[Any, Any]):

@@ -16,9 +16,9 @@ from rosafe.interface import KINDS
 from rosafe.interface.arguments import needed
 from rosafe.results.formats import check_format, format_of
 from rosafe.results.result_metadata import Contents
+from rosafe.results.view.dataset import to_xarray
+from rosafe.results.view.plot import plot
 from rosafe.system.output import new_path
-from rosafe.view.dataset import to_xarray
-from rosafe.view.plot import plot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -67,7 +67,10 @@ class Source(Protocol):
     """
 
     sample_rate: float
-    ended: bool
+
+    @property
+    def ended(self) -> bool:
+        """See the class."""
 
     @property
     def waiting(self) -> bool:

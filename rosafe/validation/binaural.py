@@ -86,9 +86,6 @@ def coherence(process: Process) -> Measured:
     return Measured.of(expected, expected, measured, "correlation", "IC")
 
 
-LEAD = "largest difference of the median over channels from 300 to 1300 Hz and all frames but the first ten"
-
-
 def lead_and_lag(itd: float, level_db: float) -> FloatArray:
     """Return noise with a reflection after 4 ms: the lead with an ITD in s, the lag with the opposite one."""
     lead, echo = noise(RATE // 2, 5), 10 ** (level_db / 20) * np.roll(noise(RATE // 2, 5), round(0.004 * RATE))

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rosafe.results.view.axes import save, style
 from rosafe.system.output import write_whole
 from rosafe.validation import published
 from rosafe.validation.binaural import lateral_itd
 from rosafe.validation.comparison import Process
 from rosafe.validation.periphery import Drnl, burst_response, drnl_measured, jepsen_drnl
 from rosafe.validation.report import Row
-from rosafe.view.axes import save, style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -77,11 +77,6 @@ def sphere_ratios(process: Process) -> tuple[FloatArray, FloatArray, FloatArray]
     return frequencies, right / left, (spectra[:, 1] / spectra[:, 0]).T
 
 
-SERIES = Origin(
-    "series of spherical functions for a plane wave, radius of 8.75 cm, evaluated by scipy", LITERATURE["duda1998"]
-)
-
-
 @ROWS.listed(
     altered("right ear louder by 0.15 dB", "responses", lambda values: values * [[1.0], [10 ** (0.15 / 20)]]),
     under_test=sphere_responses,

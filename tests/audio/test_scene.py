@@ -95,6 +95,18 @@ def test_options() -> None:
     assert open_source("scene:", 0, 1, threading.Event()).sample_rate == 44100
 
 
+def test_a_room() -> None:
+    """The reverberation of the talker has its ratio to the direct sound, and does not depend on the chunks."""
+    dry = Scene(16000).frames(48000) / 2.0**31
+    scene = Scene(16000, rt60=0.3, drr=3.0)
+    pieces = [scene.frames(count) for count in (1, 4095, 43904)]
+    wet = np.concatenate(pieces, axis=1) / 2.0**31
+    assert np.array_equal(Scene(16000, rt60=0.3, drr=3.0).frames(48000), np.concatenate(pieces, axis=1))
+    assert 10 * np.log10(np.sum(dry**2) / np.sum((wet - dry) ** 2)) == pytest.approx(3, abs=1)
+    chunk = open_source("scene:?rt60=0.3&drr=3", 16000, 800, threading.Event()).read()
+    assert chunk is not None and np.array_equal(chunk.samples / 2.0**31, wet[:, :800])
+
+
 @pytest.mark.parametrize("rate", [1000, 8000, 192000, 768000])
 def test_any_sample_rate(rate: int) -> None:
     samples = Scene(rate).frames(rate // 4)
@@ -106,7 +118,15 @@ def test_any_sample_rate(rate: int) -> None:
     ("device", "rate", "exception", "why"),
     [
         ("scene:seconds=5", 44100, "e_device", "question mark"),
-        ("scene:?speed=5", 44100, "e_device", "unknown option 'speed'; expected one of seconds, level, seed"),
+        (
+            "scene:?speed=5",
+            44100,
+            "e_device",
+            "unknown option 'speed'; expected one of seconds, level, seed, rt60, drr",
+        ),
+        ("scene:?rt60=0", 44100, "e_device", "rt60: expected a number of seconds from 0.05 to 5"),
+        ("scene:?rt60=1&drr=90", 44100, "e_device", "drr: expected a number from -20 to 40"),
+        ("scene:?drr=5", 44100, "e_device", "drr: expected together with rt60"),
         ("scene:?seconds=0", 44100, "e_device", "seconds: expected a number of seconds from 0.1"),
         ("scene:?level=3", 44100, "e_device", "level: expected a number from -120 to 0"),
         ("scene:?seed=-1", 44100, "e_device", "seed: expected a whole number"),

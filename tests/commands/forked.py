@@ -15,11 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import h5py  # noqa: F401  # the writer imports it in each child otherwise
-import numpy as np
 
 from rosafe.processing.files import process_file
-from rosafe.results import writers
-from rosafe.results.result_metadata import Contents
 from rosafe.system.output import OutputError, new_file
 from tests.commands.command import SMALL_PARAMETERS
 
@@ -64,37 +61,3 @@ def write_again_and_again(path: Path, letter: str, rounds: int) -> None:
                     os.write(descriptor, letter.encode() * 1000)
         except OutputError as problem:
             assert "is writing it" in str(problem), problem
-
-
-def end_with_number_of_writes(path: Path, writer_name: str, fail_at: float) -> None:
-    """Write a result whose write number `fail_at` fails; exit with the number of writes, or 100 after a failure."""
-    try:
-        count = _write_result(path, writer_name, fail_at)
-    except OSError as problem:
-        os._exit(100 if problem.errno == 5 else 101)
-    os._exit(count)
-
-
-def _write_result(path: Path, writer_name: str, fail_at: float) -> int:
-    count, pwrite = 0, os.pwrite
-
-    def counted(*arguments: Any) -> int:
-        nonlocal count
-        count += 1
-        if count >= fail_at:
-            raise OSError(5, "Input/output error")
-        return pwrite(*arguments)
-
-    os.pwrite = counted
-    contents = Contents(
-        {"ild": (31, 2000)}, {"ild": ("channel", "time")}, {"ild": "dB"}, {}, {"parameters": {"x": "y" * 30000}}
-    )
-    path.write_bytes(b"")
-    writer = getattr(writers, writer_name)(path, contents)
-    try:
-        for _ in range(4):
-            writer.append("ild", np.zeros((31, 500)))
-        writer.finish()
-    finally:
-        writer.close()
-    return count

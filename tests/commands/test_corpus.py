@@ -283,16 +283,6 @@ def test_empty_folders_and_a_foreign_list_of_failures(tmp_path: Path) -> None:
     assert_results(tmp_path / "out", {f"corpus/{name}": sound for name, sound in sounds.items()})
 
 
-@pytest.mark.skipif(os.getuid() == 0, reason="root may read everything")
-def test_unreadable_files(tmp_path: Path) -> None:
-    sounds = corpus(tmp_path / "corpus", 3)
-    (tmp_path / "corpus" / "sub dir").chmod(0)
-    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path)
-    (tmp_path / "corpus" / "sub dir").chmod(0o700)
-    assert done.returncode == 1 and "Permission denied" in failed(tmp_path / "out")["corpus/sub dir"]
-    assert_results(tmp_path / "out", {"s0": sounds["s0"]})
-
-
 def test_existing_results_are_kept_unless_resume_is_given(tmp_path: Path) -> None:
     sounds = corpus(tmp_path / "corpus", 2)
     assert rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path).returncode == 0
@@ -319,19 +309,6 @@ def test_killed_and_resumed(tmp_path: Path) -> None:
     done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--resume", cwd=tmp_path)
     assert done.returncode == 0 and "already complete" in done.stderr, done
     assert_results(out, sounds)
-
-
-def test_two_runs_into_one_folder(tmp_path: Path) -> None:
-    """Two runs on different files do not interact. On the same files, one run writes each result."""
-    sounds = corpus(tmp_path / "corpus", 16)
-    arguments = ("process", "corpus", "-o", "out", *OPTIONS, "--resume")
-    with start(*arguments, cwd=tmp_path) as first, start(*arguments, cwd=tmp_path) as second:
-        codes = [first.wait(), second.wait()]
-    for code, run in zip(codes, (first, second), strict=True):
-        assert code == 0 or " is writing it" in run.err or "it was created meanwhile" in run.err, run
-    done = rosafe(*arguments, cwd=tmp_path)
-    assert done.returncode == 0 and not (tmp_path / "out" / "failed.csv").exists(), done
-    assert_results(tmp_path / "out", sounds)
 
 
 def test_interrupted(tmp_path: Path) -> None:

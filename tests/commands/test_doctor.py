@@ -14,8 +14,8 @@ from rosafe.ros1.transport import paths
 from tests.commands.command import environment, rosafe, rosafe_alone
 from tests.harness import ROOT, Graph, free_port
 
-EVERYTHING = ["python", "numbers", "kernels", "plugins", "sound files", "ROS", "messages", "master", "address"]
-EVERYTHING += ["alsaaudio", "sound devices", "HTTP server", "Tcl", "plots", "extras"]
+EVERYTHING = ["python", "numbers", "kernels", "plugins", "sound files", "ROS", "messages", "ROS 2", "master", "address"]
+EVERYTHING += ["alsaaudio", "speech", "sound devices", "HTTP server", "Tcl", "plots", "extras"]
 
 
 def findings(done: subprocess.CompletedProcess[str]) -> dict[str, dict[str, str]]:

@@ -45,12 +45,6 @@ def test_other_than_two_channels(folder: Path, channels: int) -> None:
     assert_untouched(folder, "bad.wav")
 
 
-def test_no_samples(folder: Path) -> None:
-    write(folder / "bad.wav", np.zeros((2, 0)))
-    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav: expected samples, got none")
-    assert_untouched(folder, "bad.wav")
-
-
 @pytest.mark.parametrize("name", ["bad.wav", "bad.flac", "bad.aiff"])
 def test_truncated_files(folder: Path, name: str) -> None:
     whole = write(folder / name, noise(50000)).read_bytes()

@@ -15,7 +15,6 @@ import soundfile
 from rosafe import load, process
 from tests.commands.command import ROSAFE, environment, noise, rosafe, start, write
 from tests.harness import ROOT, proc, wait_for
-from tests.terminal import Terminal
 
 pytestmark = pytest.mark.long
 
@@ -170,19 +169,6 @@ def _children(pid: int) -> list[int]:
 
 
 # --- progress ---
-
-
-def test_a_terminal_shows_one_live_line(long_file: Path) -> None:
-    command = [str(ROSAFE), "process", "in.wav", "--outputs", "ild"]
-    with Terminal(command, environment(), cwd=long_file.parent, columns=80) as terminal:
-        terminal.expect(" left")
-        text = terminal.sent
-        terminal.press("\x03")
-        assert terminal.end() == 130
-    assert "\n" not in text
-    line = text.split("\r")[-1]
-    assert line.startswith("[") and " % " in line and "left" in line
-    assert max(len(line) for line in text.split("\r")) < 90
 
 
 def test_few_lines_without_a_terminal(tmp_path: Path) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
-import re
 import signal
 from contextlib import ExitStack
 from pathlib import Path
@@ -64,25 +64,6 @@ def test_the_second_recorder_is_refused(tmp_path: Path, name: str, force: tuple[
     assert sorted(os.listdir(tmp_path)) == (["a.truth.csv", name] if name == "a.wav" else [name])
     samples = written(path)
     assert samples.shape[1] > 2000 and np.array_equal(samples, Scene(RATE).frames(samples.shape[1]))
-
-
-@pytest.mark.parametrize("force", [(), ("--force",)], ids=["", "force"])
-def test_many_at_the_same_time(tmp_path: Path, force: tuple[str, ...]) -> None:
-    commands = [
-        ("record", "a.wav", "--device", f"scene:?seconds={walk}", *SCENE[2:], "--seconds", "1") for walk in range(2, 5)
-    ]
-    with ExitStack() as stack:
-        running = [stack.enter_context(start(*command, *force, cwd=tmp_path)) for command in commands]
-        codes = [recording.wait(60) for recording in running]
-        assert codes.count(0) >= 1 and (force or codes.count(0) == 1), running
-        for code, recording in zip(codes, running, strict=True):
-            assert code == 0 or re.search(r"a\.wav(: another process is writing it| already exists)", recording.err)
-    assert sorted(os.listdir(tmp_path)) == ["a.truth.csv", "a.wav"]
-    samples = written(tmp_path / "a.wav")
-    own = [np.array_equal(samples, Scene(RATE, seconds=walk).frames(RATE)) for walk in range(2, 5)]
-    assert own.count(True) == 1 and codes[own.index(True)] == 0
-    last = (tmp_path / "a.truth.csv").read_text().splitlines()[-1]
-    assert last == f"0.99,0.000,talker,{float(Scene(RATE, seconds=2 + own.index(True)).azimuth(0.99)):.3f}"
 
 
 def test_killed_recorders_leave_nothing_under_the_name(tmp_path: Path) -> None:
@@ -277,3 +258,18 @@ def test_a_check_of_a_target_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "old").write_text("old")
     output.check_target(tmp_path / "old", True)
     assert (tmp_path / "old").read_text() == "old"
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF])
+def test_outputs_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """On file systems such as NFS and Lustre."""
+
+    def flock(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    for replace in (False, True):
+        output.write_files({tmp_path / "a": b"whole"}, replace)
+    with pytest.raises(output.OutputError, match="already exists"):
+        output.check_target(tmp_path / "a", False)
+    assert (tmp_path / "a").read_text() == "whole" and len(list(tmp_path.iterdir())) == 1

@@ -41,16 +41,6 @@ def test_result_and_sound_give_the_same_picture(tmp_path: Path) -> None:
     assert (tmp_path / "sound.png").read_bytes() == (tmp_path / "same.png").read_bytes()
 
 
-@pytest.mark.parametrize(("name", "reader"), [("a.mat", "scipy.io.loadmat"), ("a.zarr", "xarray.open_zarr")])
-def test_results_that_are_not_read(tmp_path: Path, name: str, reader: str) -> None:
-    (tmp_path / name).mkdir()
-    refused(rosafe("plot", name, cwd=tmp_path), f"{name}: expected a name that ends in .npz or .h5, got ", reader)
-    target = ("-o", name) if name == "a.zarr" else ("--format", "zarr")
-    write(tmp_path / "a.wav", noise(100))
-    assert rosafe("process", "a.wav", *target, cwd=tmp_path).returncode in (1, 2)
-    assert not list((tmp_path / name).iterdir())
-
-
 def test_one_ear_at_8_khz(tmp_path: Path) -> None:
     """Outputs that compare two ears are left out, and there is one column."""
     mono = write(tmp_path / "mono.wav", noise(4000)[:1], 8000)

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from rosafe.commands.__main__ import main
-from rosafe.ros1.afe.saved_tree import TreeStateFile
-from rosafe.setups import Setup
-from rosafe.setups.setup import AcquireSettings
 from rosafe.system.terminal import printable
+from rosafe.tree.setups import Setup
+from rosafe.tree.setups.setup import AcquireSettings
+from rosafe.tree.setups.state_file import TreeStateFile
 from tests.commands.command import SMALL, noise, rosafe, write
 from tests.harness import PYTHON, SCRIPTS, Graph
 

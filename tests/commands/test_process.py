@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import soundfile
 
 from rosafe import load, process
 from rosafe.interface import CORE_REPRESENTATIONS
@@ -50,24 +49,6 @@ def test_integer_files(tmp_path: Path) -> None:
         assert_equal((tmp_path / name).with_suffix(".npz"), expected)
 
 
-def test_extensible_header(tmp_path: Path) -> None:
-    """WAVE_FORMAT_EXTENSIBLE, as many programs write it."""
-    signal = np.random.default_rng(9).integers(-128, 128, (2, 5000)) / 128
-    subtypes = ("PCM_U8", "PCM_24", "FLOAT", "DOUBLE")
-    names = []
-    for subtype in subtypes:
-        for form in ("WAV", "WAVEX"):
-            names.append(f"{subtype}-{form}.wav")
-            soundfile.write(tmp_path / names[-1], signal.T, 16000, subtype, format=form)
-    assert rosafe("process", *names, *SMALL, "--outputs", "input", cwd=tmp_path).returncode == 0
-    for subtype in subtypes:
-        with (
-            np.load(tmp_path / f"{subtype}-WAV.npz") as plain,
-            np.load(tmp_path / f"{subtype}-WAVEX.npz") as extensible,
-        ):
-            np.testing.assert_array_equal(plain["input"], extensible["input"])
-
-
 def test_float_files(tmp_path: Path) -> None:
     """Samples beyond full scale are clipped, and NaN becomes silence."""
     signal = np.random.default_rng(5).normal(0, 0.3, (2, 5000)).astype(np.float32).astype(np.float64)
@@ -83,22 +64,6 @@ def test_float_files(tmp_path: Path) -> None:
     expected = process(samples, 16000, parameters=SMALL_PARAMETERS, outputs=["input", "ratemap"])
     for subtype in subtypes:
         assert_equal(tmp_path / f"{subtype}.npz", expected)
-
-
-def test_everything_at_any_rate_with_defaults(tmp_path: Path) -> None:
-    signals = {}
-    for rate in (22050, 44100, 96000):
-        signals[rate] = np.random.default_rng(rate).integers(-(2**31), 2**31, (2, 13000)).astype(np.int32)
-        write(tmp_path / f"{rate}.wav", signals[rate], rate, "PCM_32")
-    done = rosafe("process", *(f"{rate}.wav" for rate in signals), *SEVEN, cwd=tmp_path)
-    assert done.returncode == 0, done
-    for rate, samples in signals.items():
-        expected = process(samples, rate)
-        assert set(CORE_REPRESENTATIONS) < set(expected)
-        assert_equal(tmp_path / f"{rate}.npz", expected)
-        with np.load(tmp_path / f"{rate}.npz") as loaded:
-            assert loaded["sample_rate"] == rate
-            assert loaded["block_frames"] == 12000
 
 
 def test_settings_and_blocks(tmp_path: Path) -> None:
@@ -133,17 +98,6 @@ def test_unneeded_outputs_are_absent(tmp_path: Path) -> None:
     path = write(tmp_path / "in.wav", noise(4000))
     assert rosafe("process", path, "--outputs", "preProc").returncode == 0
     assert set(load(tmp_path / "in.npz")) == {"preProc", "preProc_time", *BESIDES}
-
-
-def test_short_files(tmp_path: Path) -> None:
-    """Shorter than a window (of 320 frames), exactly one window, a fractional number of hops, exactly one block."""
-    signals = {}
-    for frames in (1, 100, 319, 320, 481, 12000, 12001):
-        signals[frames] = np.random.default_rng(frames).integers(-(2**31), 2**31, (2, frames)).astype(np.int32)
-        write(tmp_path / f"{frames}.wav", signals[frames], subtype="PCM_32")
-    assert rosafe("process", *(f"{frames}.wav" for frames in signals), *SMALL, *SEVEN, cwd=tmp_path).returncode == 0
-    for frames, samples in signals.items():
-        assert_equal(tmp_path / f"{frames}.npz", process(samples, 16000, parameters=SMALL_PARAMETERS))
 
 
 # --- several files and the paths of their results ---

@@ -16,7 +16,7 @@ import yaml
 
 from rosafe.commands import up
 from rosafe.ros1.transport.master import MasterError, check_master
-from rosafe.setups import Setup
+from rosafe.tree.setups import Setup
 from tests import models
 from tests.harness import ROOT, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
 from tests.terminal import Terminal
@@ -142,17 +142,6 @@ def test_the_localizer_without_a_setup(arguments: list[str], settings: dict[str,
     of_setup = {"head": "b.sofa", "mirror": True, "seconds": 0.25}
     kept = {"seconds": 0.25} if options.head else of_setup  # the mirror of a setup is that of its head
     assert up._localizer_settings(options, Setup(localizer=of_setup)) == {**kept, **(settings or {})}
-
-
-@pytest.mark.exploration
-def test_one_command_for_a_robot(alone: Graph, tmp_path_factory: pytest.TempPathFactory) -> None:
-    models.learn(tmp_path_factory, 44100.0)
-    command = ("rosafe", "up", "--device", "scene:?seconds=3", "--localize", "--port", str(free_port()))
-    with alone.start(*command, XDG_CACHE_HOME=str(models.cache(tmp_path_factory))) as running:
-        wait_until(running, "localizer +runs +head: sphere")
-        wait_until(running, r"bass +runs +acquires from scene:\?seconds=3")
-        wait_until(running, "rosAFE +runs +[1-9][0-9]* processors")  # those of the localizer
-        assert running.stop(signal.SIGINT) == 0, running
 
 
 def test_a_faulty_setup_starts_no_process(alone: Graph, tmp_path: Path) -> None:

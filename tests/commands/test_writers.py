@@ -66,23 +66,6 @@ def test_the_second_writer_is_refused_while_the_first_one_writes(tmp_path: Path,
     assert os.listdir(target.parent) == [target.name]
 
 
-@pytest.mark.parametrize("extension", EXTENSIONS)
-def test_many_concurrent_writers(tmp_path: Path, extension: str) -> None:
-    paths, expected = sounds(tmp_path, 3)
-    out = tmp_path / "out"
-    out.mkdir()
-    for replace in (False, True):
-        target = out / f"{replace}{extension}"
-        others = [Other(path, target, replace) for path in paths]
-        results = [other.result() for other in others]
-        endings = ("done", "is writing it", "already exists; --force replaces it", "was created meanwhile")
-        assert all(result.endswith(endings) for result in results), results
-        assert "done" in results and (replace or results.count("done") == 1)
-        own = [np.array_equal(ild_in(target), one) for one in expected]
-        assert own.count(True) == 1 and results[own.index(True)] == "done"
-        assert not [name for name in os.listdir(out) if name.endswith(".part")]
-
-
 # --- full disks ---------------------------------------------------------------------------------------------------
 
 _FILLED = """
@@ -168,17 +151,3 @@ def test_disks_that_become_full_at_any_point(tmp_path: Path, small_disk: tuple[P
 def test_limited_file_size(tmp_path: Path) -> None:
     (tmp_path / "room").mkdir()
     filled(tmp_path, "limit", tmp_path / "room")
-
-
-@pytest.mark.parametrize("name", ["H5Writer", "Mat73Writer"])
-def test_hdf5_after_a_failure_at_any_write(tmp_path: Path, name: str) -> None:
-    """Each attempt runs in its own process, because the library used to end it."""
-
-    def code(fail_at: float) -> int:
-        process = forked.start(forked.end_with_number_of_writes, tmp_path / "a", name, fail_at)
-        process.join(60)
-        return process.exitcode or 0
-
-    count = code(np.inf)
-    assert 5 < count < 90
-    assert {code(fail_at) for fail_at in {1, 2, *range(3, count, 4), count - 1, count}} == {100}

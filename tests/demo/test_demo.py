@@ -19,7 +19,7 @@ from rosafe.localization import model_cache
 from rosafe.localization.scene import Truth
 from tests.audio.pulseaudio import PulseServer
 from tests.demo.conftest import SCENE_RATE, Learn
-from tests.demo.running import DEMO_SECONDS, Demo, check_picture, check_table, path
+from tests.demo.running import DEMO_SECONDS, Demo, check_picture, check_table, check_walk, path
 from tests.harness import ROOT, SCRIPTS, shared, wait_for
 
 STAGES = {
@@ -51,6 +51,7 @@ def test_scenes_files_and_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     scene = choose("scene:", 10.0)
     assert (scene.device, scene.sample_rate, scene.seconds, scene.block) == ("scene:", 44100, 10.0, 12000)
     assert [scene.source.truth(time).azimuths for time in (0.0, 5.0, 10.0)] == [(90.0,), (0.0,), (-90.0,)]
+    assert choose("scene:?rt60=0.4", 10.0).title == "A source moves from left to right in a room"
     two = "{sample_rate: 16000, duration: 3, sources: [{name: a, signal: noise, azimuth: 30, end: 2}]}"
     Path("two.yaml").write_text(two)
     scene = choose("scene:two.yaml", 10.0)
@@ -101,6 +102,16 @@ def test_speech(tmp_path: Path, learn: Learn) -> None:
     assert "the last 0.14 s are shorter than a block of 4000 frames and are omitted\n" in demo.out
     assert (np.array(path(demo.out))[:, 1] < -15).all()
     check_picture(tmp_path / "new" / "folder" / "rosafe-demo.png")
+
+
+@pytest.mark.exploration
+def test_a_room(tmp_path: Path, learn: Learn) -> None:
+    """The directions in the table are right in a room with a reverberation time of 0.4 s, too."""
+    learn(SCENE_RATE)
+    with Demo("scene:?rt60=0.4", cwd=tmp_path) as demo:
+        demo.assert_ends(0)
+    check_walk(demo.out)
+    check_picture(tmp_path / "rosafe-demo" / "rosafe-demo.png")
 
 
 @pytest.mark.exploration

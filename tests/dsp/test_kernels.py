@@ -542,7 +542,14 @@ def test_the_processor_check_uses_no_newer_instructions() -> None:
 
 def direction_model(channels: int, rng: np.random.Generator) -> DirectionModel:
     """Return a model with random tables."""
-    description = {"sample_rate": RATE, "parameters": {}, "head": "", "is_sphere": True, "level_gain_db": 0.0}
+    description = {
+        "sample_rate": RATE,
+        "parameters": {},
+        "head": "",
+        "is_sphere": True,
+        "max_itd": 1e-3,
+        "level_gain_db": 0.0,
+    }
     rows = channels * cues.CLASSES
     tables = [rng.normal(0, 1, (rows * bins + 1, kernels.DIRECTIONS)) for bins in (cues.ITD_BINS, cues.ILD_BINS)]
     for table in tables:

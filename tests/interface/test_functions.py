@@ -27,7 +27,7 @@ from rosafe.plugin import Parameter, Representation, Stage, variant
 from rosafe.representations.ratemap import Ratemap
 
 Slow = variant(Ratemap, "slow", "srm", "Slow ratemap", srm_decaySec=0.1)
-View = variant(Ratemap, "view", "vw", "Has the name of a package")
+View = variant(Ratemap, "tree", "vw", "Has the name of a package")
 Process = variant(Ratemap, "process", "prc", "Has the name of a function")
 
 
@@ -128,7 +128,7 @@ def test_refusals_are_those_of_process() -> None:
     assert "ild" in computed(rosafe.ild, SOUND[0], RATE)
     with pytest.raises(TypeError):
         rosafe.ratemap(SOUND, RATE, 0.01)  # type: ignore[call-arg, arg-type]
-    for name in ("ratemaps", "view.plot", "_ratemap", ""):
+    for name in ("ratemaps", "tree.plot", "_ratemap", ""):
         assert not hasattr(rosafe, name)
 
 
@@ -136,7 +136,7 @@ def test_plugins_have_functions(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(PLUGIN)
     code = (
         "import inspect, numpy as np, rosafe\n"
-        "from rosafe import odd, slow, view\n"
+        "from rosafe import odd, slow, tree\n"
         "sound = np.random.default_rng(0).standard_normal((2, 4000))\n"
         "assert np.array_equal(slow(sound, 16000), rosafe.ratemap(sound, 16000, decaySec=0.1))\n"
         "assert np.array_equal(slow(sound, 16000, decaySec=0.008), rosafe.ratemap(sound, 16000))\n"
@@ -144,7 +144,7 @@ def test_plugins_have_functions(tmp_path: Path) -> None:
         "print(inspect.signature(slow).parameters['decaySec'])\n"
         "print(*inspect.signature(odd).parameters)\n"
         "print(np.array_equal(odd(sound, 16000, od_lambda=0.0), 0 * rosafe.ihc(sound, 16000)))\n"
-        "print(type(view), rosafe.process.__module__)\n"
+        "print(type(tree), rosafe.process.__module__)\n"
     )
     done = python(code, tmp_path)
     assert done.stderr == ""

@@ -35,6 +35,7 @@ def test_every_representation_has_references_with_valid_conditions(kind: str) ->
     [
         ("package.xml", r'<maintainer email="[^"]+">{}</maintainer>'),
         ("bass/package.xml", r'<maintainer email="[^"]+">{}</maintainer>'),
+        ("ros2/rosafe_msgs/package.xml", r'<maintainer email="[^"]+">{}</maintainer>'),
         ("pyproject.toml", r'authors = \[{{ name = "{}", email = "[^"]+" }}\]'),
         ("debian/control", r"Maintainer: {} <[^>]+>"),
         ("debian/copyright", r"Copyright: the {}"),

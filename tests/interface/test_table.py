@@ -10,7 +10,7 @@ import pytest
 import rosafe
 from rosafe import interface
 from rosafe.declarations.idl import SCALARS
-from rosafe.interface import BASS, ROSAFE, ComponentSpec, Service
+from rosafe.interface import BASS, ROSAFE, ComponentSpec, Service, ros2
 from tests import harness
 
 FOLDERS = {"rosAFE": harness.ROOT, "bass": harness.ROOT / "bass"}
@@ -169,8 +169,20 @@ def test_exceptions() -> None:
             assert short in known, f"{service.name} throws {thrown}"
 
 
-@COMPONENTS
-def test_version_is_that_of_the_package(component: ComponentSpec) -> None:
-    manifest = ElementTree.parse(FOLDERS[component.name] / "package.xml")
+@pytest.mark.parametrize("name", ["rosAFE", "bass", "rosafe_msgs"])
+def test_version_is_that_of_the_package(name: str) -> None:
+    manifest = ElementTree.parse(FOLDERS.get(name, harness.ROOT / "ros2" / name) / "package.xml")
     assert manifest.findtext("version") == rosafe.__version__
-    assert manifest.findtext("name") == component.name
+    assert manifest.findtext("name") == name
+
+
+@pytest.mark.parametrize(
+    ("package", "name"), [(c.name, name) for c in interface.COMPONENTS.values() for name in c.messages]
+)
+def test_messages_of_ros_2_have_the_fields_of_ros_1(package: str, name: str) -> None:
+    (own,) = parts(FOLDERS[package] / "msg" / f"{name}.msg")
+    others = {"Header": "std_msgs/Header", "time": "builtin_interfaces/Time"}
+    expected = [(others.get(kind, kind), field.replace("frameIndex", "frame_index")) for kind, field in own]
+    (found,) = parts(harness.ROOT / ros2.FOLDER / "msg" / f"{name}.msg")
+    assert found[: len(expected)] == expected
+    assert all(field == field.lower() for _, field in found)

@@ -27,7 +27,7 @@ def sphere_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def kemar_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the file of a model of the MIT KEMAR head, learned from less sound than usual.
+    """Return the file of a model of the MIT KEMAR head.
 
     The first process of a run of the tests that needs it learns it.
     """
@@ -37,9 +37,7 @@ def kemar_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with open(path.with_suffix(".lock"), "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not path.exists():
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(training, "SOUND_SECONDS", 400.0)
-                training.learn_head(Head.from_sofa(KEMAR), RATE).save(path)
+            training.learn_head(Head.from_sofa(KEMAR), RATE).save(path)
     return path
 
 

@@ -29,6 +29,7 @@ def model() -> DirectionModel:
         "parameters": {"fb_nChannels": CHANNELS},
         "head": "random",
         "is_sphere": False,
+        "max_itd": 1e-3,
         "level_gain_db": 0.0,
     }
     tables = [RANDOM.standard_normal((rows * bins + 1, len(angles.grid()))) for bins in (ITD_BINS, ILD_BINS)]

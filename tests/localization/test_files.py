@@ -20,9 +20,9 @@ import pytest
 
 import rosafe
 from rosafe.localization import angles, cues, model_cache, results
+from rosafe.localization import stored_noise as noise
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.noise import NoiseCalibration
-from rosafe.ros1.localizer import noise
 from rosafe.system import trust
 from tests.harness import PYTHON, ROOT
 from tests.localization.test_head import write_sofa
@@ -282,11 +282,12 @@ def small_model(parameters: dict[str, Any], head: str = "a head") -> dict[str, n
     """Return the arrays of a model of 8 kHz whose directions are equally likely."""
     described = cues.describe(8000.0, parameters)
     values = {
-        "format": "rosafe direction model 1",
+        "format": "rosafe direction model 2",
         "sample_rate": 8000.0,
         "parameters": cues.model_parameters(described),
         "head": head,
         "is_sphere": True,
+        "max_itd": cues.MAX_ITD,
         "level_gain_db": 1.5,
     }
     rows = len(described["fb_cfHz"]) * cues.CLASSES

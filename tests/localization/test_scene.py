@@ -183,7 +183,7 @@ def test_the_device_rejects_other_rates_and_quotes_nothing(tmp_path: Path) -> No
     assert "ends in .yaml" in caught.value.reason
 
 
-@pytest.mark.parametrize("name", ["talker_in_noise", "two_sources_crossing", "turning_head"])
+@pytest.mark.parametrize("name", ["talker_in_noise", "talkers_in_room", "two_sources_crossing", "turning_head"])
 def test_the_examples_can_be_read(name: str) -> None:
     if not KEMAR.exists() or not Path("/usr/share/sounds/alsa/Front_Center.wav").exists():
         pytest.skip("libmysofa1 or alsa-utils is not installed")

@@ -13,11 +13,9 @@ from scipy.spatial.transform import Rotation
 
 import rosafe
 from rosafe.commands.__main__ import main
-from rosafe.localization import angles, training
+from rosafe.localization import angles, settings, training
 from rosafe.localization.horizontal_plane import near_ear_gain
 from rosafe.localization.sofa import read_sofa
-from rosafe.ros1.localizer import node
-from rosafe.ros1.localizer import settings as node_settings
 from tests.harness import shared
 
 h5py = pytest.importorskip("h5py")
@@ -357,11 +355,11 @@ def test_the_option_of_head_learn(
 def test_the_setting_of_the_node() -> None:
     given = {"head": "a.sofa", "mirror": False, "seconds": 0.5, "world_frame": "", "head_frame": "head"}
     given |= {"rosafe": "rosAFE", "connect": "", "audio_delay": 0.0, "noise": "none"}
-    assert node_settings.read_settings(given).mirror is False
-    assert node_settings.read_settings({**given, "mirror": ""}).mirror is None  # of the launch file
+    assert settings.checked_settings(given).mirror is False
+    assert settings.checked_settings({**given, "mirror": ""}).mirror is None  # of the launch file
     with pytest.raises(ValueError, match="mirror: expected true or false, got 'no'"):
-        node_settings.read_settings({**given, "mirror": "no"})
+        settings.checked_settings({**given, "mirror": "no"})
     with pytest.raises(ValueError, match="mirror: expected a SOFA file as the head, got 'sphere'"):
-        node.Models(node_settings.LocalizerSettings(mirror=True))
+        settings.Models(settings.LocalizerSettings(mirror=True))
     with pytest.raises(ValueError, match="world_frame: expected another frame than head_frame, got 'head'"):
-        node_settings.read_settings({**given, "world_frame": "/head"})
+        settings.checked_settings({**given, "world_frame": "/head"})

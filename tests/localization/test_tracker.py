@@ -101,7 +101,7 @@ def test_mirrored_sources_with_similar_evidence_are_both_found() -> None:
 
 
 def test_a_known_source_needs_less_evidence() -> None:
-    weak = {30.0: 0.6, -20.0: 0.13}
+    weak = {30.0: 0.6, -20.0: 0.11}
     assert present_at_end([weak] * 40) == [30]
     assert present_at_end([{30.0: 0.5, -20.0: 0.3}] * 10 + [weak] * 40) == [-20, 30]
     assert present_at_end([{30.0: 0.5, -20.0: 0.3}] * 10 + [{30.0: 0.6}] * 20) == [30]

@@ -13,21 +13,11 @@ import pytest
 from tests.web.genomix.world import World
 
 COMMAND = ("octave-cli", "--norc", "--quiet", "--no-history")
-SHOW = """\
-function show(name, value)
-  printf('%s=%s\\n', name, jsonencode(value));
-end
-"""
-MESSAGE = """\
-function text = message(work)
-  text = '';
-  try
-    work();
-  catch problem
-    text = [problem.identifier ' ' problem.message];
-  end
-end
-"""
+
+
+def script(name: str) -> str:
+    """Return a script in the folder `scripts`."""
+    return (Path(__file__).with_name("scripts") / f"{name}.m").read_text("utf-8")
 
 
 def require_program(program: str = "octave-cli") -> None:
@@ -41,16 +31,16 @@ def environment(world: World) -> dict[str, str]:
     return {"GENOMIXD": f"127.0.0.1:{world.port}", "LANG": "C.UTF-8", "DISPLAY": ""}
 
 
-def command(folder: Path, script: str) -> tuple[str, ...]:
-    """Return the command that runs `script` in `folder`.
+def command(folder: Path, text: str) -> tuple[str, ...]:
+    """Return the command that runs a script in `folder`.
 
     The script may call ``show(name, value)``, and ``message(@() ...)``, which returns identifier and text of an error.
     """
     require_program()
-    (folder / "show.m").write_text(SHOW)
-    (folder / "message.m").write_text(MESSAGE)
+    for name in ("show", "message"):
+        (folder / f"{name}.m").write_text(script(name))
     path = folder / "script.m"
-    path.write_text(textwrap.dedent(script), "utf-8")
+    path.write_text(textwrap.dedent(text), "utf-8")
     return ("sh", "-c", 'cd "$1" && shift && exec "$@"', "sh", str(folder), *COMMAND, path.name)
 
 

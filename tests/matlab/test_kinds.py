@@ -81,62 +81,7 @@ CLASSES = {
 
 @pytest.mark.exploration
 def test_all_representations_are_equal_to_their_ports(world: World, sound: Path) -> None:
-    results = octave.run_and_parse(
-        world,
-        begin(sound)
-        + """
-        words = fieldnames(dObj).';
-        show('words', words);
-        for word = words
-            sOut = mObj.addProcessor(word{1}, par);
-            show(['of ' word{1}], {sOut{1}.Label, cellfun(@class, sOut, 'UniformOutput', false), ...
-                cellfun(@(signal) signal.Channel, sOut, 'UniformOutput', false), ...
-                cellfun(@(signal) signal.Name, sOut, 'UniformOutput', false)});
-        end
-        for word = words(1:7:end)
-            mObj.addProcessor(word{1}, par);
-        end
-        show('counts', structfun(@numel, mObj.Processors)); % there are no duplicates
-        processors = rosAFE.getProcessors();
-        processors = processors.result.processors(:).';
-        full = @(processor) size(dObj.(processor.kind){1}.Data, 1) >= 0.3 * processor.rate;
-        while ! all(cellfun(full, processors))
-            pause(0.1);
-            mObj.processChunk();
-        end
-        bass.Stop();
-        left = processors;
-        while ! isempty(left) % until the data object contains all frames of the ports
-            pause(0.1);
-            mObj.processChunk();
-            waiting = {};
-            for processor = left
-                out = rosAFE.(processor{1}.port)('-m', processor{1}.name).(processor{1}.port);
-                fields = fieldnames(out)(4:end).';
-                fields = fields(! strncmp(fields, 'numberOf', 8));
-                kind = processor{1}.kind;
-                signals = dObj.(kind);
-                same = out.framesOnPort > 0;
-                for k = 1:numel(signals)
-                    same = same && isequaln(signals{k}.Data(end-out.framesOnPort+1:end, :, :), out.(fields{k}));
-                end
-                if same
-                    show(kind, [out.framesOnPort / processor{1}.rate, size(signals{1}.Data)(2:end)]);
-                else
-                    waiting{end + 1} = processor{1};
-                end
-            end
-            left = waiting;
-        end
-        show('fList', {dObj.pitch{1}.fList, dObj.spectralFeatures{1}.fList});
-        show('alike', isequal(dObj.onsetStrength{1}.cfHz, dObj.itd{1}.cfHz, dObj.zeroCrossings{1}.cfHz));
-        show('lags', [dObj.autocorrelation{2}.lags(2), dObj.crosscorrelation{1}.lags(1)]);
-        shown = {dObj.pitch{1}, dObj.itd{1}, dObj.amsFeatures{1}, dObj.autocorrelation{1}, dObj.time{1}};
-        show('figures', cellfun(@(signal) ishghandle(signal.plot()), shown));
-        mObj.cleanup();
-        show('clean', structfun(@numel, mObj.Processors));
-        """,
-    )
+    results = octave.run_and_parse(world, begin(sound) + octave.script("all_representations"))
     kinds = {kind.word: kind for kind in KINDS.values()}
     assert results["words"] == [*kinds, "zeroCrossings"]
     assert results["counts"] == [1] * (len(kinds) + 1)
@@ -162,25 +107,7 @@ def test_all_representations_are_equal_to_their_ports(world: World, sound: Path)
 
 def test_pitch_and_time_differences_of_a_tone_and_of_silence(world: World, sound: Path) -> None:
     """NaN is NaN in MATLAB and Tcl, and null in JSON."""
-    results = octave.run_and_parse(
-        world,
-        begin(sound, port=3)
-        + """
-        sOut = mObj.addProcessor('pitch', below);
-        mObj.addProcessor('itd', below);
-        data = zeros(0, 3);
-        while ! any(isnan(data(:, 1))) || sum(data(:, 1) > 0) < 50
-            pause(0.1);
-            mObj.processChunk();
-            data = sOut{1}.Data;
-        end
-        pitch = data(:, strcmp(sOut{1}.fList, 'pitch'));
-        show('pitch', median(pitch(! isnan(pitch))));
-        show('finite', all(isfinite(data(:, 2:3))(:)));
-        times = dObj.itd{1}.Data(:, 1:10);
-        show('itd', median(times(times != 0)));
-        """,
-    )
+    results = octave.run_and_parse(world, begin(sound, port=3) + octave.script("pitch_and_time_differences"))
     assert results["pitch"] == pytest.approx(PITCH, rel=0.01)
     assert results["finite"]
     assert abs(results["itd"]) == pytest.approx(DELAY / RATE, rel=0.1)
@@ -201,60 +128,9 @@ def test_pitch_and_time_differences_of_a_tone_and_of_silence(world: World, sound
     assert np.median([float(value) for value in values if float(value) > 0]) == pytest.approx(PITCH, rel=0.01)
 
 
-SCRIPT = """
-    p = mObj.addProcessor('onsetStrength', par);
-    parameters = genParStruct('sf_br_cf', 1000, 'sf_ro_perc', 0.9, 'sf_requests', {'flux', 'centroid'}, ...
-        'fb_highFreqHz', 3000);
-    p = mObj.addProcessor('spectralFeatures', parameters);
-    assert(p{1}.fList(:).', {'flux', 'centroid'});
-    one = mObj.Processors.spectralFeatures{1};
-    assert({one.sf_brCF, one.sf_roPerc, one.sf_requests(:).'}, {1000, 0.9, {'flux', 'centroid'}});
-    breebaart = genParStruct('fb_highFreqHz', 3000, 'adpt_model', 'adt_breebart');
-    p = mObj.addProcessor('adaptation', breebaart);
-    assert(mObj.Processors.adaptation{1}.adpt_model, 'adt_breebaart');
-    assert(cellfun(@isstruct, {mObj.hasProcessor('spectralFeaturesProc', parameters), ...
-        mObj.hasProcessor('spectralFeatures', below), mObj.hasProcessor('adaptationProc', breebaart), ...
-        mObj.hasProcessor('adaptation', genParStruct('fb_highFreqHz', 3000, 'adpt_model', 'adt_puschel')), ...
-        mObj.hasProcessor('onsetProc', par), mObj.hasProcessor('onsetProc', below)}), logical([1 0 1 0 1 0]));
-    range = genParStruct('fb_highFreqHz', 3000, 'p_pitchRangeHz', [100 300]);
-    p = mObj.addProcessor({'pitch', 'ic'}, {range, par});
-    assert(cell2mat(mObj.Processors.pitch{1}.pi_rangeHz), [100 300]);
-    p = mObj.addProcessor('pitch', genParStruct('fb_highFreqHz', 3000, 'pi_rangeHz', [100 300]));
-    modulations = genParStruct('fb_nChannels', 4, 'fb_highFreqHz', 3000, 'ams_nFilter', 3, 'ams_lowFreqHz', 8);
-    p = mObj.addProcessor('amsFeatures', modulations);
-    filters = cell2mat(mObj.Processors.amsFeatures{1}.ams_cfHz);
-    show('modulations', {p{2}.cfHz, p{2}.modCfHz, isequal(p{2}.modCfHz, filters)});
-    assert(isstruct(mObj.hasProcessor('modulationProc', modulations)));
-    p = mObj.addProcessor('precedence', par);
-    show('precedence', {p{1}.cfHz, numel(p{3}.lags), p{3}.lags(1) == -p{3}.lags(end)});
-    p = mObj.addProcessor('gabor', par);
-    show('gabor', {numel(p{1}.fList), p{1}.fList{end}});
-    assert([numel(mObj.Processors.pitch), size(dObj.pitch, 1)], [1 1]);
-
-    mObj.modifyParameter('spectralFeatures_0', 'sf_requests', {'rolloff', 'crest', 'flux'});
-    mObj.modifyParameter('pitch_0', 'pi_rangeHz', [90 310.5]);
-    show('changed', {dObj.spectralFeatures{1, 2}.fList, mObj.Processors.pitch{1}.pi_rangeHz});
-    mObj.deleteProcessor('onsetStrength', 1);
-    assert([size(dObj.onsetStrength, 1), numel(mObj.Processors.onsetStrength)], [0 0]);
-
-    other = rosAFE.OffsetProc('mine', 'ratemap_0'); % not created by the manager
-    other = rosAFE.getRepresentation('mine');
-    assert(other.result.parts{1}.name, 'offsetStrength');
-    mObj.processChunk();
-    assert({dObj.offsetStrength{1, 2}.Label, mObj.Processors.offsetStrength{1}.name}, {'mine', 'mine'});
-
-    show('none of it', message(@() mObj.addProcessor('pitch', genParStruct('pi_rangeHz', [-1 100]))));
-    show('not there', message(@() mObj.hasProcessor('pitch', genParStruct('fb_nERB', 1))));
-    show('bad word', message(@() mObj.addProcessor('spectralFeatures', genParStruct('sf_requests', {'charm'}))));
-    show('no type', message(@() mObj.deleteProcessor('spikes', 1)));
-    show('no name', message(@() dObj.spikes));
-    show('read only', message(@() subsasgn(dObj, substruct('.', 'pitch'), 3)));
-"""
-
-
 @pytest.mark.exploration
 def test_names_and_parameters_of_the_matlab_front_end(world: World, sound: Path) -> None:
-    results = octave.run_and_parse(world, begin(sound) + SCRIPT)
+    results = octave.run_and_parse(world, begin(sound) + octave.script("names_and_parameters"))
     frequencies, modulations, same = results["modulations"]
     assert len(frequencies) == 4 and len(modulations) == 3 and same and modulations[0] == 8
     assert results["precedence"][0] == frequencies and results["precedence"][1] % 2 == 1 and results["precedence"][2]
@@ -269,31 +145,7 @@ def test_names_and_parameters_of_the_matlab_front_end(world: World, sound: Path)
 
 def test_plots_of_features(world: World) -> None:
     """The pitch is plotted over the raw pitch, in Hz; other features are scaled to their own range."""
-    results = octave.run_and_parse(
-        world,
-        """
-        startRosAFE;
-        names = {'pitch', 'rawPitch', 'confidence'};
-        pitch = FeatureSignal(10, 10, 'pitch', 'pitch_0', names, 'left');
-        pitch.appendChunk([NaN 0 0.1; 120 120 0.9; 125 125 0.8; NaN 300 0.2]);
-        figure('visible', 'off');
-        pitch.plot();
-        lines = get(gca(), 'children'); % the top one is first
-        show('pitch', {get(lines(1), 'ydata'), get(lines(2), 'ydata'), get(lines(1), 'xdata')});
-        show('unit', get(get(gca(), 'ylabel'), 'string'));
-        figure('visible', 'off');
-        pitch.plot([], 'confidence');
-        show('confidence', {get(get(gca(), 'children'), 'ydata'), get(get(gca(), 'ylabel'), 'string')});
-        features = FeatureSignal(10, 10, 'spectralFeatures', 'spectralFeatures_0', {'flux', 'hfc', 'crest'}, 'left');
-        figure('visible', 'off');
-        features.plot(); % no frames yet
-        features.appendChunk([0 1e6 5; 2 3e6 5; 1 2e6 5]);
-        figure('visible', 'off');
-        features.plot();
-        show('ranges', get(get(gca(), 'children'), 'cdata'));
-        show('features', get(gca(), 'yticklabel').');
-        """,
-    )
+    results = octave.run_and_parse(world, octave.script("plots_of_features"))
     on_top, under, times = results["pitch"]
     assert on_top == [None, 120, 125, None] and under == [None, 120, 125, 300]
     assert times == pytest.approx([0, 0.1, 0.2, 0.3]) and results["unit"] == "Hz"

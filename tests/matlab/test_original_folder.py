@@ -47,29 +47,6 @@ classdef NAME < handle
     end
 end
 """
-CLIENT = """
-    clear all; close all; clc;
-    addpath(genpath('/home/user/genom_ws/rosAFE/examples'));
-    [ bass, rosAFE, client ] = initRosAFE( );
-    sampleRate = 16000;
-    dObj = dataObject_RosAFE( bass, rosAFE, 'scene:', sampleRate, 1600, 1, 1, 1, 10 );
-    mObj = manager_RosAFE(dObj);
-    mObj.addProcessor('ild');
-    mObj.addProcessor('ratemap');
-    mObj.addProcessor('pitch', genParStruct('fb_nChannels', 4));
-    mObj.addProcessor('crosscorrelation', genParStruct('fb_nChannels', 4));
-    mObj.addProcessor('amsFeatures', genParStruct('fb_nChannels', 4));
-    mObj.modifyParameter( 'time_0', 'pp_bRemoveDC', '0' );
-    mObj.processChunk( );
-    while isempty(dObj.ild{1}.Data) || isempty(dObj.pitch{1}.Data) || isempty(dObj.amsFeatures{1}.Data)
-        pause(0.1);
-        mObj.processChunk( );
-    end
-    show('columns', [size(dObj.ild{1}.Data, 2), size(dObj.pitch{1}.Data, 2)]);
-    show('class', class(dObj.pitch{1}));
-    mObj.deleteProcessor( 'ild', 1 );
-    show('left', numel(mObj.Processors.ild));
-"""
 
 
 def _lines(text: str) -> str:
@@ -89,27 +66,12 @@ def test_a_client_script_in_the_original_folder(world: World, tmp_path: Path, fr
             (folder / f"{name}.m").write_text(FRONT_END.replace("NAME", name).lstrip(), "utf-8")
     # startRosAFE, which initRosAFE calls last, moves our folder to the front of the path
     first = "initRosAFE( );" + (" addpath(fullfile(pwd, 'AuditoryFrontEnd'));" if front_end else "")
-    shown = octave.run_and_parse(world, CLIENT.replace("initRosAFE( );", first), folder=tmp_path)
+    shown = octave.run_and_parse(
+        world, octave.script("client_in_the_original_folder").replace("initRosAFE( );", first), folder=tmp_path
+    )
     assert shown["columns"] == [31, 3]
     assert shown["class"] == ("rosafe.FeatureSignal" if front_end else "FeatureSignal")
     assert shown["left"] == 0
-
-
-# Functions of Two!Ears, which add folders to the path: without Two!Ears nothing happens; with it, before or behind our
-# folder, its own functions are called.
-STARTS = """
-    ours = path();
-    startTwoEars; startTwoEars(); startTwoEars('Config.xml'); startTwoEars('info'); startAuditoryFrontEnd;
-    show('unchanged', strcmp(ours, path()));
-    addpath(fullfile(pwd, 'TwoEars'));
-    startTwoEars;
-    startRosAFE;
-    startTwoEars('Config.xml'); startAuditoryFrontEnd('all');
-    show('first', strsplit(path(), pathsep()){2});
-    show('wrong', message(@() startTwoEars('missing.xml')));
-    show('still', strcmp(fileparts(which('startTwoEars')), fileparts(which('startRosAFE'))));
-    cd(fileparts(which('startRosAFE'))); startTwoEars;
-"""
 
 
 @pytest.mark.exploration
@@ -122,7 +84,7 @@ def test_functions_that_start_two_ears(world: World, tmp_path: Path) -> None:
             f"show('{name}_', varargin);\nend\n"
         )
         (folder / f"{name}.m").write_text(text, "utf-8")
-    output = octave.run(world, STARTS, folder=tmp_path)
+    output = octave.run(world, octave.script("starts_of_two_ears"), folder=tmp_path)
     assert [line for line in output.splitlines() if "_=" in line] == [
         "startTwoEars_=[]",
         'startTwoEars_=["Config.xml"]',

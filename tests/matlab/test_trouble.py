@@ -13,47 +13,6 @@ from tests.web.genomix import world as worlds
 
 pytestmark = pytest.mark.ros
 
-SCRIPT = """
-    1; % a script that starts with functions
-    function signal_test(name)
-        fclose(fopen(name, 'w'));
-    end
-    function await(name)
-        while exist(name, 'file') ~= 2
-            pause(0.02);
-        end
-    end
-    client = genomix.client;
-    bass = client.load('bass');
-    acquire = bass.Acquire('-a', 'scene:');
-    show('sent', acquire.status);
-    signal_test('1 kill the node');
-    status = acquire.wait(60);
-    show('killed', {status, acquire.exception.ex, acquire.exception.detail.what});
-    r = bass.ListDevices();
-    show('dead', {r.status, r.exception.ex});
-    p = bass.Audio();
-    show('dead port', {class(p), p.status});
-    show('load', message(@() client.load('bass')));
-    signal_test('2 start the node');
-    await('3 the node is back');
-    again = bass.Acquire('-a', 'scene:');
-    show('back', again.status);
-
-    signal_test('4 end the server');
-    await('5 the server has ended');
-    show('gone', message(@() bass.Stop()));
-    show('gone status', message(@() again.status));
-    delete(bass);
-    signal_test('6 start the server');
-    await('7 the server is back');
-    bass = client.load('bass');
-    show('forgotten', {again.status, again.exception.ex});
-    show('works', bass.Stop().status);
-    delete(client);
-    show('closed', message(@() client.load('bass')));
-"""
-
 
 def test_components_and_servers_that_end(tmp_path: Path) -> None:
     """The script and the test synchronize with files."""
@@ -68,7 +27,11 @@ def test_components_and_servers_that_end(tmp_path: Path) -> None:
         graph.node("bass-ros") as node,
     ):
         world = worlds.World(graph, master, server, port)
-        script = graph.start(*octave.command(tmp_path, SCRIPT), cwd=None, **octave.environment(world))
+        script = graph.start(
+            *octave.command(tmp_path, octave.script("components_and_servers_that_end")),
+            cwd=None,
+            **octave.environment(world),
+        )
         await_file("1 kill the node")
         node.stop(signal.SIGKILL)
         await_file("2 start the node")

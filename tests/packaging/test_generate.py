@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness import PATIENCE, PYTHON, ROOT, Graph, run_together
+from tests.harness import PYTHON, ROOT, Graph, run_together
 from tests.packaging.clone import environment, fresh_copy, generate, keep_few_definitions, run, without_rights
 
 IMPORT = (
@@ -106,33 +106,6 @@ def test_killed_generator(copy: Path, delay: float) -> None:
     build.wait()
     imported(copy, run(PYTHON, "-c", IMPORT, env=environment(PYTHONPATH=str(copy))))
     assert len(generations(copy / ".generated")) == 1, "leftovers of the killed generator are removed"
-
-
-def test_second_generator_waits_for_the_first(copy: Path) -> None:
-    """A process that holds the lock blocks other generators until it ends."""
-    (copy / ".generated").mkdir()
-    hold = (
-        "import fcntl, sys, threading; f = open(sys.argv[1], 'w'); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); "
-    )
-    hold += "threading.Event().wait()"
-    lock = copy / ".generated" / "lock"
-    holder = subprocess.Popen([PYTHON, "-c", hold, str(lock)], stdout=subprocess.PIPE)
-    waiting = subprocess.Popen(list(map(str, generate(copy))), env=environment(), cwd="/")
-    try:
-        assert holder.stdout is not None
-        holder.stdout.readline()
-        with pytest.raises(subprocess.TimeoutExpired):
-            waiting.wait(1.0)
-        assert not (copy / ".generated" / "current").exists()
-        holder.kill()
-        assert waiting.wait(PATIENCE) == 0
-    finally:
-        for process in (holder, waiting):
-            process.kill()
-            process.wait()
-        if holder.stdout is not None:
-            holder.stdout.close()
-    assert (copy / ".generated" / "current").exists()
 
 
 @contextmanager

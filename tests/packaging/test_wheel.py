@@ -101,7 +101,8 @@ def test_wheel_and_sdist_have_all_files(built: dict[str, Path]) -> None:
         assert re.fullmatch(rf"rosafe-{re.escape(VERSION)}-py3-none-manylinux_2_\d+_x86_64.whl", built["wheel"].name)
     assert (metadata["Name"], metadata["Version"]) == ("rosafe", VERSION)
     assert metadata["Requires-Python"] == ">=3.10" and metadata["Summary"] and metadata["Author-email"]
-    assert set(metadata.get_all("Provides-Extra", [])) == {"plot", "files", "dask", "notebook", "torch", "all"}
+    expected = {"plot", "files", "dask", "notebook", "torch", "speech", "all"}
+    assert set(metadata.get_all("Provides-Extra", [])) == expected
     with tarfile.open(built["sdist"]) as sdist:
         sources = {name.partition("/")[2] for name in sdist.getnames()}
     assert files_of_the_package() | {"pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md"} <= sources

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rosafe.setups import read
+from rosafe.tree.setups import read
 from tests.harness import SCRIPTS, Graph, wait_for
 from tests.web.genomix.world import Http, HttpError, port_of
 

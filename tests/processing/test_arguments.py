@@ -54,7 +54,6 @@ def refused(match: str, *arguments: Any, **named: Any) -> None:
             np.zeros((3, 100)),
             r"expected shape \(N,\) or \(1, N\) for one ear, \(2, N\) or \(N, 2\) for two, got shape \(3, 100\)",
         ),
-        (np.zeros((100, 1)), r"shape \(100, 1\)"),
         (np.zeros((0, 3)), r"shape \(0, 3\)"),
         (np.zeros((2, 2, 100)), "shape"),
         (np.float64(0), "^signal: expected an array of shape .*, got float64"),
@@ -62,11 +61,8 @@ def refused(match: str, *arguments: Any, **named: Any) -> None:
         ("sound.wav", r"^signal: expected an array of shape \(N,\) or \(1, N\) .*, got str"),
         ([[1.0, 2.0], [3.0]], "^signal: expected an array, got list: "),
         (np.zeros((2, 10), np.int8), "expected a float type, int32 or int16, got int8"),
-        (np.zeros((2, 10), np.int64), "got int64"),
         (np.zeros((2, 10), np.uint32), "got uint32"),
         (np.zeros((2, 10), bool), "got bool"),
-        (np.zeros((2, 10), complex), "got complex128"),
-        (np.zeros((2, 10), object), "got object"),
         (np.array([["a"], ["b"]]), "got <U1"),
         (np.array([[0.0, np.nan], [0.0, 0.0]]), "NaN or infinite"),
         (np.array([[0.0, 0.0], [0.0, -np.inf]]), "NaN or infinite"),
@@ -98,47 +94,24 @@ def test_a_sample_rate_that_is_too_low_for_the_channels() -> None:
     ("parameters", "match"),
     [
         ({"fb_nErbs": 1}, r"^parameters: expected a known parameter, got 'fb_nErbs'; did you mean fb_nERBs\?"),
-        ({"nchannels": 1}, r"^parameters: expected a known parameter, got 'nchannels'; did you mean fb_nChannels\?"),
         ({"volume": 1}, "^parameters: expected a known parameter, got 'volume'; there are: in_doNormalize, "),
         ({"name": "x"}, "^parameters: expected a known parameter, got 'name'"),
         ({"set_rm_scailing": "_power"}, "^parameters: expected a known parameter, got "),
         ({5: 1}, "^parameters: expected a known parameter, got 5"),
         ([("fb_nERBs", 1)], "parameters: expected a dict of names and values, got list"),
-        ("fb_nERBs", "parameters: expected a dict of names and values, got str"),
-        ({"fb_nERBs": np.nan}, "fb_nERBs: expected a finite number, got nan"),
         ({"fb_nERBs": "1"}, "fb_nERBs: expected a finite number, got '1'"),
-        ({"fb_nERBs": None}, "fb_nERBs: expected a finite number, got None"),
-        ({"fb_nERBs": True}, "fb_nERBs: expected a finite number, got True"),
-        ({"fb_nERBs": 0}, "fb_nERBs: expected a number above 0, at most 100, got 0"),
         ({"fb_nERBs": 1e-3}, "fb_nERBs: expected a distance that gives at most 1024 channels, got 0.001"),
-        ({"fb_nChannels": 1.5}, "fb_nChannels: expected a whole number, got 1.5"),
-        ({"fb_nChannels": -1}, "fb_nChannels: expected a number in the range of unsigned long, got -1"),
         ({"fb_lowFreqHz": 9000.0}, r"fb_lowFreqHz: expected less than fb_highFreqHz \(.* Hz\), got 9000 Hz"),
-        ({"fb_cfHz": [100.0, np.inf]}, "fb_cfHz: expected a finite number, got inf"),
         ({"fb_cfHz": np.ma.masked}, "fb_cfHz: expected a finite number, got nan"),
-        ({"fb_lowFreqHz": np.ma.array(80.0, mask=True)}, "fb_lowFreqHz: expected a finite number, got nan"),
-        ({"fb_cfHz": [[100.0]]}, r"fb_cfHz: expected a finite number, got \[100.0\]"),
         ({"fb_cfHz": "100"}, "fb_cfHz: expected a list of double, got '100'"),
         ({"fb_cfHz": itertools.count(1)}, "fb_cfHz: expected at most 1024 values, got more"),
-        ({"fb_cfHz": [8000.0]}, "fb_cfHz: expected channels below half the sample rate, got one at 8000 Hz"),
-        ({"pp_bRemoveDC": "yes"}, "pp_bRemoveDC: expected a boolean, got 'yes'"),
-        ({"pp_bRemoveDC": 2}, "pp_bRemoveDC: expected a boolean, got 2"),
-        (
-            {"pp_bRemoveDC": True, "pp_cutoffHzDC": 8000},
-            "pp_cutoffHzDC: expected less than half .*, got 8000 Hz",
-        ),
+        ({"pp_bRemoveDC": True, "pp_cutoffHzDC": 8000}, "pp_cutoffHzDC: expected less than half .*, got 8000 Hz"),
         ({"pp_middleEarModel": "human"}, "pp_middleEarModel: expected one of jepsen, lopezpoveda, got 'human'"),
-        ({"ihc_method": "Dau"}, "ihc_method: expected one of none, halfwave"),
-        ({"ihc_method": "jespen"}, "ihc_method: expected one of none, halfwave"),
-        ({"ild_wname": 5}, "ild_wname: expected a string, got 5"),
         ({"ild_wSizeSec": 1e-6}, "ild_wSizeSec: expected at least one sample"),
-        ({"ild_wSizeSec": 1e6}, "ild_wSizeSec: expected a number above 0, at most 60, got 1000000"),
-        ({"rm_decaySec": 0}, "rm_decaySec: expected a number above 0, at most 3600, got 0"),
-        ({"cc_maxDelaySec": -1e-3}, "cc_maxDelaySec: expected a number above 0, at most 10, got -0.001"),
-        ({"in_normalizeValue": 0}, "in_normalizeValue: expected a number from 1 to 18446744073709551615, got 0"),
     ],
 )
 def test_parameters(parameters: Any, match: str) -> None:
+    """tests/interface has the rules of single parameters."""
     refused(match, GOOD, RATE, parameters=parameters)
 
 
@@ -146,7 +119,6 @@ def test_parameters(parameters: Any, match: str) -> None:
     ("parameters", "match"),
     [
         ({"pi_rangeHz": [400, 80]}, r"pi_rangeHz: expected ascending numbers, got \[400.0, 80.0\]"),
-        ({"pi_rangeHz": [80, 80]}, r"pi_rangeHz: expected ascending numbers, got \[80.0, 80.0\]"),
         ({"fb_lowFreqHz": 5000, "fb_highFreqHz": 100}, r"fb_lowFreqHz: expected less than fb_highFreqHz \(100 Hz\), "),
         ({"ams_lowFreqHz": 500, "ams_highFreqHz": 5}, r"ams_highFreqHz: expected more than ams_lowFreqHz \(500 Hz\), "),
     ],
@@ -183,21 +155,12 @@ def test_block_sizes(block_frames: Any) -> None:
     ("modifications", "match"),
     [
         (5, "expected a sequence of"),
-        (None, "expected a sequence of"),
-        ("abc", "expected a sequence of"),
         ([5], "expected a sequence of"),
-        ([()], "expected a sequence of"),
-        ([(0, "fb_nERBs")], "expected a sequence of"),
         ((0, "fb_nERBs", 2), "expected a sequence of"),
         ([(-1, "fb_nERBs", 2)], "expected a block number, got -1"),
-        ([(1.0, "fb_nERBs", 2)], "expected a block number, got 1.0"),
         ([(True, "fb_nERBs", 2)], "expected a block number, got True"),
-        ([("0", "fb_nERBs", 2)], "expected a block number, got '0'"),
         ([(0, "fb_nErbs", 2)], "^parameters: expected a known parameter, got 'fb_nErbs'"),
-        ([(0, ["fb_nERBs"], 2)], r"^parameters: expected a known parameter, got \['fb_nERBs'\]"),
         ([(0, "set_rm_scailing", "_log")], "rm_scaling: expected one of power, magnitude, got 'log'"),
-        ([(0, "set_rm_scailing", 1)], "rm_scaling: expected a string, got 1"),
-        ([(0, "fb_nERBs", 0)], "fb_nERBs: expected a number above 0, at most 100, got 0"),
         ([(99, "fb_nERBs", 0)], "fb_nERBs: expected a number above 0, at most 100, got 0"),
         ([(0, "ihc_method", "none"), (0, "ihc_method", "nothing")], "ihc_method: expected one of none, halfwave"),
         ([(9, "fb_highFreqHz", 9000.0)], "fb_highFreqHz: expected channels below half the sample rate, got one at"),
@@ -205,7 +168,6 @@ def test_block_sizes(block_frames: Any) -> None:
             [(3, "fb_highFreqHz", 100.0), (2, "fb_lowFreqHz", 200.0)],
             r"fb_lowFreqHz: expected less than fb_highFreqHz \(100 Hz\), got 200 Hz",
         ),
-        ([(0, "ild_wSizeSec", 1e-6)], "ild_wSizeSec: expected at least one sample"),
     ],
 )
 def test_modifications(modifications: Any, match: str) -> None:
@@ -228,15 +190,6 @@ def test_modifications(modifications: Any, match: str) -> None:
 )
 def test_outputs(outputs: Any, match: str) -> None:
     refused(match, GOOD, RATE, outputs=outputs)
-
-
-def test_suggestions_list_each_name_once() -> None:
-    with pytest.raises(
-        ValueError, match=r"^parameters: expected a known parameter, got 'xyzzy'; there are: in_doNormalize, "
-    ) as raised:
-        rosafe.process(GOOD, RATE, parameters={"xyzzy": 1})
-    names = str(raised.value).partition("there are: ")[2].split(", ")
-    assert len(names) == len(set(names)) and "trm_minSpread" in names
 
 
 @pytest.mark.parametrize("signal", [GOOD[0], GOOD[:1], list(GOOD[0])])

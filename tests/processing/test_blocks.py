@@ -242,26 +242,6 @@ def test_a_branch_for_each_worker(count: int, channels: int, shares: list[int], 
 
 
 @with_kernels
-@given(
-    given_parameters=parameters,
-    outputs=st.sets(st.sampled_from(APART), min_size=1),
-    count=st.integers(2, 5),
-    channels=st.integers(9, 40),
-)
-@settings(max_examples=30)
-def test_numbers_are_independent_of_branches(
-    given_parameters: dict[str, Any], outputs: set[str], count: int, channels: int
-) -> None:
-    options: dict[str, Any] = {"parameters": {**FEW, **given_parameters, "fb_nChannels": channels}}
-    options["outputs"] = sorted(outputs)
-    with workers(1):
-        alone = rosafe.process(SOUND, RATE, **options)
-    with workers(count) as seen:
-        assert_same(rosafe.process(SOUND, RATE, **options), alone)
-        assert max(seen) < channels
-
-
-@with_kernels
 def test_stages_across_channels_have_one_branch() -> None:
     for kind in sorted(BUILTIN - set(APART) - {"input", "preProc"}):
         with workers(2) as seen:

@@ -213,22 +213,6 @@ def test_two_ears_along_either_axis() -> None:
     assert rosafe.process(np.zeros((0, 2)), RATE, outputs="input")["input"].shape == (2, 0)
 
 
-@pytest.mark.parametrize("signal", [SOUND[0], SOUND[:1], SOUND[0].tolist()])
-def test_one_ear(signal: Any) -> None:
-    """Outputs have one row for the ear, equal to that of two equal ears."""
-    changes = [(1, "fb_nChannels", 3)]
-    got = rosafe.process(signal, RATE, parameters=FEW, block_frames=1000, modifications=changes)
-    both = rosafe.process(SOUND[[0, 0]], RATE, parameters=FEW, block_frames=1000, modifications=changes)
-    per_ear = ("input", "preProc", "gammatone", "ihc", "ratemap")
-    assert {name for name in got if name in CORE_REPRESENTATIONS} == set(per_ear)
-    for name in per_ear:
-        np.testing.assert_array_equal(got[name], both[name][:1])
-    kinds = [kind for kind, stage in STAGES.items() if not stage.REPRESENTATION.binaural]
-    got = rosafe.process(signal[:1500] if isinstance(signal, list) else signal[..., :1500], RATE, outputs=kinds)
-    rows = [np.shape(got[name])[0] for kind in kinds for name in STAGES[kind].REPRESENTATION.outputs]
-    assert set(rows) == {1}
-
-
 def test_integers_are_scaled_as_in_files() -> None:
     short = (2**15 * 0.9 * np.random.default_rng(5).uniform(-1, 1, (2, 500))).astype(np.int16)
     long = short.astype(np.int32) * 2**16
@@ -360,31 +344,6 @@ def test_changes_apply_before_their_blocks() -> None:
     assert results["fb_cfHz"][-1] == 4000.0
 
 
-def test_misspelt_names_of_changes() -> None:
-    """The misspelt names of the original's modifyParameter are accepted too."""
-    for wrong, right in (
-        (("set_rm_scailing", "_magnitude"), ("rm_scaling", "magnitude")),
-        (("set_rm_scailing", "magnitude"), ("rm_scaling", "magnitude")),
-        (("pp_refSPLdBS", 60.0), ("pp_refSPLdB", 60.0)),
-    ):
-        got, wanted = (
-            rosafe.process(
-                SOUND,
-                RATE,
-                parameters={**FEW, "pp_bLevelScaling": True},
-                block_frames=1000,
-                modifications=[(1, *change)],
-                outputs=["preProc", "ratemap"],
-            )
-            for change in (wrong, right)
-        )
-        unchanged = rosafe.process(
-            SOUND, RATE, parameters={**FEW, "pp_bLevelScaling": True}, block_frames=1000, outputs=["preProc", "ratemap"]
-        )
-        assert_same(got, wanted, tolerance=0)
-        assert not np.array_equal(got["ratemap"], unchanged["ratemap"])
-
-
 def test_changes_of_kinds_that_are_not_computed_have_no_effect() -> None:
     with_changes = rosafe.process(
         SOUND, RATE, parameters=FEW, modifications=[(0, "ild_wname", "hamming")], outputs=["preProc"]
@@ -415,15 +374,6 @@ def test_lags_and_channels_that_change_leave_zeros_outside() -> None:
         np.testing.assert_allclose(block[:, :channels], outputs[number]["ihc"], rtol=0, atol=1e-12)
         assert not block[:, channels:].any()
     assert at == results["crossCorrelation"].shape[-1]
-
-
-def test_a_change_in_every_block() -> None:
-    """A thousand changes are checked quickly."""
-    changes = [(block, "rm_decaySec", 0.001 + 1e-5 * block) for block in range(1000)]
-    results = rosafe.process(
-        noise(1000), RATE, parameters=FEW, block_frames=1, modifications=changes, outputs=["ratemap"]
-    )
-    assert results["ratemap"].shape == (2, 4, 5)
 
 
 # --- several at once, and ends before the end ---

@@ -23,8 +23,8 @@ import rosafe
 from rosafe.processing.corpus import write_failed
 from rosafe.processing.files import process_file
 from rosafe.results import hdf5_reading, isolated, readers
+from rosafe.results.view.plot import draw
 from rosafe.system.output import OutputError
-from rosafe.view.plot import draw
 from tests.harness import PYTHON, ROOT
 from tests.results.damage import VALUES, damaged, forked
 

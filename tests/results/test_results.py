@@ -312,41 +312,6 @@ def test_windows_too_short_for_the_pitch_range() -> None:
         rosafe.process(SOUND, RATE, parameters=FEW, outputs="autocorrelation")
 
 
-FORMANTS = {"a": (730, 1090, 2440), "i": (270, 2290, 3010), "u": (300, 870, 2240), "e": (530, 1840, 2480)}
-
-
-def vowel(frequency: float, formants: tuple[int, ...], rate: int) -> np.ndarray:
-    """A pulse train through three resonators of 90 Hz bandwidth."""
-    sound = np.diff(np.floor(np.arange(int(0.5 * rate)) * frequency / rate), prepend=0)
-    radius = np.exp(-np.pi * 90 / rate)
-    for formant in formants:
-        coefficients = [1, -2 * radius * np.cos(2 * np.pi * formant / rate), radius**2]
-        sound = scipy.signal.lfilter([1], coefficients, sound)
-    return np.asarray(0.1 * sound / sound.std())
-
-
-@pytest.mark.parametrize("rate", [RATE, pytest.param(44100, marks=pytest.mark.exploration)])
-def test_the_preset_for_speech_on_vowels(rate: int) -> None:
-    errors: list[np.ndarray] = []
-    for frequency in (80, 87, 100, 123, 150, 171, 200, 237, 300):
-        for formants in FORMANTS.values():
-            sound = vowel(frequency, formants, rate)
-            result = rosafe.process(sound, rate, parameters=rosafe.PRESETS["speech"], outputs="pitch")
-            pitch = result["pitch"][0, 0, 8:-8]
-            errors.append(~(np.abs(pitch / frequency - 1) <= 0.2))
-    assert np.concatenate(errors).mean() <= 0.01
-
-
-@pytest.mark.parametrize("formants", [(700, 1220, 2600), *FORMANTS.values()])
-@pytest.mark.parametrize("frequency", [260, 310, 345, 380, 392])
-def test_the_preset_for_speech_on_high_voices(frequency: int, formants: tuple[int, ...]) -> None:
-    """The octave below is not reported."""
-    sound = vowel(frequency, formants, RATE)
-    result = rosafe.process(sound, RATE, parameters=rosafe.PRESETS["speech"], outputs="pitch")
-    cents = 1200 * np.log2(result["pitch"][0, 0, 8:-8] / frequency)
-    assert np.mean(np.abs(cents) <= 50) >= 0.95
-
-
 def glottal_vowel(rng: np.random.Generator, low: float, high: float, snr: float) -> tuple[np.ndarray, np.ndarray]:
     """A glide of glottal pulses with jitter and shimmer through random formants, in noise, and its pitch."""
     begin, end = rng.uniform(low, high, 2)

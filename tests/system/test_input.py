@@ -20,10 +20,10 @@ from rosafe.commands.setup import read_file
 from rosafe.interface import ComponentError
 from rosafe.processing.corpus import write_failed
 from rosafe.processing.files import process_file
-from rosafe.ros1.afe.saved_tree import TreeStateFile
-from rosafe.setups import Setup
 from rosafe.system import input as inputs
 from rosafe.system.input import open_descriptor, open_regular, read_regular
+from rosafe.tree.setups import Setup
+from rosafe.tree.setups.state_file import TreeStateFile
 from tests.harness import PYTHON, SCRIPTS, Graph, proc
 
 RESULTS = (".npz", ".h5")

@@ -18,6 +18,7 @@ _CONTROL = re.compile("[\0-\x1f\x7f-\x9f\u2028\u2029]")  # would break a line of
 BUILT_IN = (
     ("file:PATH", "a sound file in real time; ?loop=1 repeats it, ?start=SECONDS skips its beginning, ?channels=3,4"),
     ("bag:PATH", "a recording of a port Audio by rosbag; ?topic=/bass/Audio, ?loop=1, ?start=SECONDS"),
+    ("topic:/NAME", "sound in messages of another driver; ?channels=3,4, ?format=S16LE&rate=16000&of=2"),
     ("scene:FILE.yaml", "a scene of several sources with known truth; docs/scenes.md describes the file"),
     ("scene:", "a source that moves from far left to far right and back; ?seconds=10&level=-30&seed=0"),
 )
@@ -58,6 +59,8 @@ def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: 
     """
     if _CONTROL.search(device):
         raise device_error(f"{device!r}: expected the name of a device, got control characters in it")
+    if device.startswith("topic:"):
+        raise device_error(f"{device}: expected a running node that subscribes; acquire it with bass")
     # Imported here, so that a missing library affects only the source that needs it.
     if device.startswith("file:"):
         from rosafe.audio.devices.file import FileSource

@@ -49,7 +49,8 @@ class SoundSource(Protocol):
     def read(self) -> Chunk | None:
         """Wait for the next chunk; None at the end of the source or after a stop.
 
-        Raises ComponentError if the source fails permanently.
+        The chunk is empty if no sound arrives for the moment, and there is a remark about it. Raises
+        ComponentError if the source fails permanently.
         """
 
     def close(self) -> None:
@@ -60,7 +61,7 @@ def take_remarks(source: SoundSource) -> list[str]:
     """Return lines for the log about the sound of a source, each once."""
     remarks: list[str] = getattr(source, "remarks", [])
     taken = remarks[:]
-    remarks.clear()
+    del remarks[: len(taken)]  # another thread may append one meanwhile
     return taken
 
 

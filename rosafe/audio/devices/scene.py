@@ -16,12 +16,16 @@ from scipy import signal
 from rosafe.audio.devices.base import PacedSource, device_error, hwparams_error, parse_options
 from rosafe.audio.files.audiofile import to_int32
 from rosafe.localization.filters import HOP, SourceRenderer
-from rosafe.localization.scene import BLOCK, SceneRenderer, Truth
+from rosafe.localization.rectangular_room import MAX_DRR, MAX_RT60, MIN_DRR, MIN_RT60, RectangularRoom, RoomReflections
+from rosafe.localization.reverberation import Reverberation
+from rosafe.localization.scene import BLOCK, DEFAULT_DISTANCE, SceneRenderer, Truth
+from rosafe.localization.scene_signals import uniform
 from rosafe.localization.sphere import sphere_filters
 from rosafe.system.option_types import number, seconds, whole_number
 
 WALK_SECONDS = 10.0
 LEVEL_DB = -30.0
+DRR_DB = 5.0  # in a room
 MIN_RATE = 1000  # Hz; almost no sound would remain below
 _PITCH = (125.0, 25.0, 0.37)  # Hz: mean, excursion and speed of the talker's gliding voice
 _SYLLABLE = 0.25  # s
@@ -41,16 +45,33 @@ class Scene:
     level : float
         RMS level of the source, before the head, in dB below full scale.
     seed : int
-        Seed of the noise.
+        Seed of noise and room.
+    rt60 : float, optional
+        Reverberation time of a room in s; without a room by default.
+    drr : float
+        Direct-to-reverberant ratio in the room, dB.
     """
 
-    def __init__(self, sample_rate: int, seconds: float = WALK_SECONDS, level: float = LEVEL_DB, seed: int = 0) -> None:
+    def __init__(
+        self,
+        sample_rate: int,
+        seconds: float = WALK_SECONDS,
+        level: float = LEVEL_DB,
+        seed: int = 0,
+        rt60: float | None = None,
+        drr: float = DRR_DB,
+    ) -> None:
         self.sample_rate = sample_rate
         self.seconds = seconds
         self._carrier = _Carrier(sample_rate, seed)
         first_second = _Carrier(sample_rate, seed).block(np.arange(sample_rate) / sample_rate)
         self._gain = 10 ** (level / 20) / np.sqrt(np.mean(first_second**2))
-        self._renderer = SourceRenderer(sphere_filters(sample_rate))
+        filters = sphere_filters(sample_rate)
+        self._renderer = SourceRenderer(filters)
+        self._reverberation = None
+        if rt60 is not None:
+            reflections = RoomReflections(RectangularRoom.drawn(rt60, drr, seed), filters, sample_rate, seed)
+            self._reverberation = Reverberation(reflections, [DEFAULT_DISTANCE], BLOCK)
         self._frame = 0  # number of the first frame of the next block
         self._block = np.zeros((2, 0), np.int32)
 
@@ -75,7 +96,12 @@ class Scene:
         times = (self._frame + np.arange(BLOCK + 1)) / self.sample_rate
         self._frame += BLOCK
         source = self._gain * self._carrier.block(times[:-1])
-        return to_int32(self._renderer.process(source, self.azimuth(times[::HOP])))
+        azimuths = self.azimuth(times[::HOP])
+        ears = self._renderer.process(source, azimuths)
+        if self._reverberation is not None:
+            ears += self._reverberation.add(0, source, azimuths, np.zeros_like(azimuths))
+            ears += self._reverberation.tail()
+        return to_int32(ears)
 
 
 class SceneSource(PacedSource):
@@ -85,7 +111,8 @@ class SceneSource(PacedSource):
     ----------
     text : str
         Options, after an optional question mark: ``seconds`` of one walk (default 10), ``level`` in dB below full
-        scale (default -30), ``seed`` of the noise (default 0).
+        scale (default -30), ``seed`` of noise and room (default 0), ``rt60`` in s for a room, ``drr`` in dB in it
+        (default 5).
     """
 
     frames = None  # it has no end
@@ -95,6 +122,8 @@ class SceneSource(PacedSource):
         if text and not text.startswith("?"):
             raise device_error(f"{self.name}: expected options after a question mark, such as scene:?seconds=5")
         options = parse_options(self.name, text[1:], _OPTIONS)
+        if "drr" in options and "rt60" not in options:
+            raise device_error(f"{self.name}: drr: expected together with rt60, such as scene:?rt60=0.4&drr=5")
         if sample_rate < MIN_RATE:
             raise hwparams_error(f"{self.name}: expected a sample rate of at least {MIN_RATE} Hz, got {sample_rate}")
         self._scene = scene = Scene(sample_rate, **options)
@@ -109,6 +138,8 @@ _OPTIONS = {
     "seconds": seconds(0.1, 86400),
     "level": number(-120, 0, "a number"),
     "seed": whole_number(0, 10**18 - 1),
+    "rt60": seconds(MIN_RT60, MAX_RT60),
+    "drr": number(MIN_DRR, MAX_DRR, "a number"),
 }
 
 
@@ -131,9 +162,7 @@ class _Carrier:
         """Return the samples at `times` (s), which must follow those of the previous call."""
         within = np.mod(times, _SYLLABLE) / _SYLLABLE
         voiced, self._tilt_state = signal.lfilter(*self._tilt, self._voice(times), zi=self._tilt_state)
-        # random_raw is the same in all versions of numpy; distributions may differ.
-        uniform = (self._random.random_raw(len(times)) >> np.uint64(11)) * 2.0**-52 - 1.0
-        noise, self._band_state = signal.sosfilt(self._band, uniform, zi=self._band_state)
+        noise, self._band_state = signal.sosfilt(self._band, uniform(self._random, len(times)), zi=self._band_state)
         voiced *= np.where(within < 0.7, np.sin(np.pi * within / 0.7) ** 2, 0.0)
         noise *= 0.05 + np.where(within > 0.6, np.sin(np.pi * (within - 0.6) / 0.4) ** 2, 0.0)
         return 2.0 * voiced + 3.0 * noise

@@ -9,10 +9,10 @@ import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.audio.files.windows import MAX_WINDOW
+from rosafe.audio.stream.ring import AudioReader, AudioRing
 from rosafe.interface import ROSAFE
 from rosafe.ros1.component import serialization
-from rosafe.ros1.component.audio import AudioReader, AudioRing
-from rosafe.ros1.transport.log_throttle import ThrottledLog
+from rosafe.system.log_throttle import ThrottledLog
 from rosafe.tree.tree import Tree
 
 RECEIVE_BYTES = 4096  # that rospy reads at a time; the rest of a message is received without its buffer
@@ -61,6 +61,11 @@ class AudioInput:
             queue_size=None,  # no message is dropped: a window can be shorter than a pause of this thread
             tcp_nodelay=True,
         )
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        if self._subscriber is not None:
+            self._subscriber.unregister()
 
     def open_reader(self, frames_per_block: int, interrupted: Callable[[], bool]) -> AudioReader | None:
         """Return a reader that starts with the next frame; None without audio, or if `interrupted()`."""

@@ -23,7 +23,7 @@ from rosafe.interface import KINDS, REQUEST, ROSAFE, ComponentError, Representat
 from rosafe.representations import PLUGINS, PROBLEMS, STAGES, WARNINGS
 from rosafe.ros1.afe import responses
 from rosafe.ros1.afe.audio_input import AudioInput
-from rosafe.ros1.afe.processor_health import ChoiceFallbacks
+from rosafe.ros1.afe.choice_fallbacks import ChoiceFallbacks
 from rosafe.ros1.afe.published_tree import PublishedTree
 from rosafe.ros1.afe.saved_tree import SavedTree
 from rosafe.ros1.afe.trace_port import TracePort
@@ -31,9 +31,9 @@ from rosafe.ros1.component import serialization
 from rosafe.ros1.component.activities import Activity, Handler
 from rosafe.ros1.component.component import ComponentNode
 from rosafe.ros1.component.startup import run_server
-from rosafe.setups import Setup, SetupError, dry_run, plan, read, read_parameters, setup_processor, write
 from rosafe.tree.block import Source
 from rosafe.tree.processor import Processor
+from rosafe.tree.setups import Setup, SetupError, dry_run, plan, read, read_parameters, setup_processor, write
 from rosafe.tree.tree_builder import RequestResult, TreeBuilder
 from rosafe.tree.tree_planner import NewProcessor, TreePlan, kind_of
 from rosafe.tree.workers import workers_to_use

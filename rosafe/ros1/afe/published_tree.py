@@ -6,15 +6,18 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import rospy
+
+from rosafe.audio.stream.frame_clock import LinearClock
 from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError
+from rosafe.ros1.afe.choice_fallbacks import ChoiceFallbacks
 from rosafe.ros1.afe.ports import OutputPort
-from rosafe.ros1.afe.processor_health import ChoiceFallbacks, ProcessorHealth
 from rosafe.ros1.component import serialization
 from rosafe.ros1.component.activities import Activity
 from rosafe.ros1.component.component import ComponentNode
-from rosafe.ros1.component.frame_clock import LinearClock
 from rosafe.ros1.transport.publisher import NewestMessage, Publisher
 from rosafe.tree.block import Block
+from rosafe.tree.health import ProcessorHealth
 from rosafe.tree.processor import Processor, next_output
 from rosafe.tree.tree import Failure, Tree
 
@@ -62,7 +65,7 @@ class PublishedTree:
         self._newest_frame = (0, LinearClock(0.0, 0.0, 1.0))  # of `_newest_time`
         self._meters = {kind: node.meters[ROSAFE.service(r.request).task] for kind, r in KINDS.items()}
         self.tree = Tree(self, workers, real_time=True)
-        self.health = ProcessorHealth(self.tree, choices)
+        self.health = ProcessorHealth(self.tree, rospy.logwarn, rospy.logerr, lambda: choices.lines)
         self.on_executed = self.health.executed
 
     def run(self, activity: Activity, processor: Processor, save: Callable[[], None]) -> None:

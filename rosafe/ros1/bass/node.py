@@ -14,17 +14,19 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.audio.devices import SoundSource, device_lines, open_source
 from rosafe.audio.devices.alsa import AlsaSource, DeviceBusyError
+from rosafe.audio.stream.capture import Capture, Snapshot, check_window
+from rosafe.audio.stream.truth import TruthSource
 from rosafe.interface import BASS, ComponentError
-from rosafe.ros1.bass.capture import Capture, Snapshot, check_window
-from rosafe.ros1.bass.scene_truth import TruthPublisher, TruthSource
+from rosafe.ros1.bass.scene_truth import TruthPublisher
 from rosafe.ros1.bass.socket_server import DEFAULT_HOST, DEFAULT_PORT, DedicatedSocket
+from rosafe.ros1.bass.topic_source import TopicSource
 from rosafe.ros1.component import serialization
 from rosafe.ros1.component.activities import Activity
 from rosafe.ros1.component.component import ComponentNode
 from rosafe.ros1.component.startup import run_server
 from rosafe.ros1.transport import master
-from rosafe.ros1.transport.log_throttle import ThrottledLog
 from rosafe.ros1.transport.publisher import Publisher
+from rosafe.system.log_throttle import ThrottledLog
 from rosafe.system.terminal import printable
 
 FRAMES: tuple[str, ...] = ("world", "head")  # default names of coordinate frames
@@ -116,6 +118,8 @@ class BassNode:
         return TruthPublisher(cast(TruthSource, source), self._truth, self._truth_class, frames)
 
     def _open(self, activity: Activity, device: str, sample_rate: int, frames_per_chunk: int) -> SoundSource:
+        if device.startswith("topic:"):
+            return TopicSource(device[len("topic:") :], sample_rate, frames_per_chunk, activity.stop_requested)
         try:
             return open_source(device, sample_rate, frames_per_chunk, activity.stop_requested)
         except DeviceBusyError:
@@ -179,6 +183,8 @@ class BassNode:
         source, snapshot = self._source, self._snapshot
         if source is None:
             status.summary(DiagnosticStatus.OK, "idle")
+        elif problem := getattr(source, "problem", ""):
+            status.summary(DiagnosticStatus.WARN, f"capturing, but {problem}")
         elif source.overruns:
             status.summary(DiagnosticStatus.WARN, f"capturing, {source.overruns} gaps so far")
         else:

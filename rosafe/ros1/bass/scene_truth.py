@@ -3,38 +3,20 @@
 from __future__ import annotations
 
 import math
-import threading
-import time
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import rospy
 
 from rosafe.audio.devices.base import wall_time_ns
+from rosafe.audio.stream.truth import TruthLoop, TruthSource
 from rosafe.ros1.transport.publisher import Publisher
 
 if TYPE_CHECKING:
     from rosafe.localization.scene import Truth  # imports scipy, which the options of bass-ros need not wait for
 
-PERIOD = 0.05  # s of the scene between two messages
-_START_POLL = 0.005  # s, until the source has started
 
-
-class TruthSource(Protocol):
-    """A source of sound whose true directions are known."""
-
-    sample_rate: int
-    frames: int | None  # length; None without an end
-
-    @property
-    def started(self) -> float | None:
-        """When the first frame was due, on the clock of time.monotonic."""
-
-    def truth(self, time: float) -> Truth:
-        """Return the directions at a time in s from the first frame."""
-
-
-class TruthPublisher:
-    """Publishes the truth of one scene every 50 ms, on a thread of its own, from `start` to `stop`.
+class TruthPublisher(TruthLoop):
+    """Publishes the truth of one scene; a context.
 
     Parameters
     ----------
@@ -49,41 +31,18 @@ class TruthPublisher:
     """
 
     def __init__(self, source: TruthSource, publisher: Any, message_class: Any, frames: tuple[str, ...]) -> None:
-        self._source = source
+        super().__init__(source, self._publish_truth)
         self._publisher = publisher
         self._message_class = message_class
         self._transform = _HeadTransform(*frames)
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="scene truth", daemon=True)
-
-    def __enter__(self) -> None:
-        """Begin to publish; the first message follows the first frame of the source."""
-        self._thread.start()
 
     def __exit__(self, *_: object) -> None:
         """End, and take the transform back."""
-        self._stopping.set()
-        self._thread.join()
+        super().__exit__()
         self._transform.close()
 
-    def _run(self) -> None:
-        while (started := self._source.started) is None:
-            if self._stopping.wait(_START_POLL):
-                return
-        rate, number = self._source.sample_rate, 0
-        while True:
-            frame = round(number * PERIOD * rate)
-            if self._source.frames is not None and frame >= self._source.frames:
-                return
-            moment = started + frame / rate
-            if self._stopping.wait(max(0.0, moment - time.monotonic())):
-                return
-            self._publish(frame, wall_time_ns(moment), self._source.truth(frame / rate))
-            # After a delay the thread continues with the present; it does not publish old states.
-            number = max(number + 1, math.floor((time.monotonic() - started) / PERIOD))
-
-    def _publish(self, frame: int, time_ns: int, truth: Truth) -> None:
-        stamp = rospy.Time(*divmod(time_ns, 1_000_000_000))
+    def _publish_truth(self, frame: int, moment: float, truth: Truth) -> None:
+        stamp = rospy.Time(*divmod(wall_time_ns(moment), 1_000_000_000))
         yaw = math.radians(truth.head_yaw)
         azimuths = [math.radians(azimuth) for azimuth in truth.azimuths]
         self._publisher.publish(

@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-from rosafe.ros1.bass.capture import Snapshot
+from rosafe.audio.stream.capture import Snapshot
 from rosafe.ros1.transport.handshake_server import keep_alive
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8081

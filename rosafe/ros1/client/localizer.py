@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rosafe.ros1.client.graph import Graph, NotRegisteredError
-from rosafe.setups import LOCALIZER
+from rosafe.tree.setups import LOCALIZER
 
 NODE = "localizer"  # in the namespace of its rosAFE
 

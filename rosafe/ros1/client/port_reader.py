@@ -121,7 +121,7 @@ class PortSubscription:
         import rospy
 
         from rosafe.ros1.component import serialization
-        from rosafe.ros1.transport.log_throttle import ThrottledLog
+        from rosafe.system.log_throttle import ThrottledLog
 
         self.topic = rospy.resolve_name(topic)
         self.lost = 0

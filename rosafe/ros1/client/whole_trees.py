@@ -5,50 +5,24 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator, Awaitable, Iterable, Mapping
-from contextlib import AbstractAsyncContextManager
-from typing import Any, Protocol
+from collections.abc import AsyncIterator, Awaitable, Mapping
+from typing import TYPE_CHECKING, Any
 
 from rosafe.declarations import ros_names
 from rosafe.interface import BASS, FIND, LOAD_SETUP, MAX_SEQUENCE, REQUEST, ROSAFE, SAVE_SETUP, ComponentError
 from rosafe.ros1.client.errors import middleware_error
-from rosafe.setups import AcquireSettings, Setup, read, write
+from rosafe.tree.setups import AcquireSettings, Setup, read, write
 from rosafe.tree.tree_planner import ancestor_kinds, kind_of
+
+if TYPE_CHECKING:
+    from rosafe.ros1.client.component_client import ComponentClient
 
 AUDIO = "Audio"
 SOUND_SECONDS = 10.0  # from Acquire to the first audio; a sound card takes a second or two
 PAUSE = 0.1
 
 
-class Services(Protocol):
-    """The services of a component."""
-
-    node: str  # full name of the node
-
-    async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Call a service and return its outputs. Raises ComponentError."""
-
-
-class Rosafe(Services, Protocol):
-    """The services of a rosAFE, and access to the rest of the graph."""
-
-    async def node_outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Call a service in its form as a ROS service."""
-
-    async def port_connected(self, port: str) -> str:
-        """Return the topic that an input port is connected to, or an empty string."""
-
-    async def published(self, topic: str) -> bool:
-        """Return whether `topic` is published."""
-
-    async def check_plugins(self, requests: Iterable[str]) -> None:
-        """Raise ComponentError if the node has not the same version of a plugin that has one of these `requests`."""
-
-    def other(self, node: str) -> AbstractAsyncContextManager[Services]:
-        """Return another component of the graph by its full name; ComponentError if there is none."""
-
-
-async def call(component: Rosafe, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+async def call(component: ComponentClient, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the outputs of a request for a whole tree: one of `ROSAFE.client_side_services`.
 
     If the task is cancelled meanwhile, everything that it has created is removed again, except processors with children
@@ -70,7 +44,7 @@ async def call(component: Rosafe, service: str, values: Mapping[str, Any]) -> Ma
     return await _create(component, service, request)
 
 
-async def save(component: Rosafe, full: bool) -> str:
+async def save(component: ComponentClient, full: bool) -> str:
     """Return the present tree, connection and acquisition as the text of a setup."""
     text = str((await component.node_outputs(SAVE_SETUP.name, {"full": full}))["setup"])
     if topic := await component.port_connected(AUDIO):
@@ -81,7 +55,7 @@ async def save(component: Rosafe, full: bool) -> str:
     return text
 
 
-async def load(component: Rosafe, text: str, wait: float = 0.0) -> dict[str, Any]:
+async def load(component: ComponentClient, text: str, wait: float = 0.0) -> dict[str, Any]:
     """Create everything that the setup `text` describes; return the outputs of `interface.LOAD_SETUP`.
 
     An existing processor, connection or acquisition is used if it agrees with the setup. If anything fails, or the task
@@ -111,7 +85,7 @@ async def load(component: Rosafe, text: str, wait: float = 0.0) -> dict[str, Any
             raise
 
 
-async def _load_tree(component: Rosafe, text: str, seconds: float) -> Mapping[str, Any]:
+async def _load_tree(component: ComponentClient, text: str, seconds: float) -> Mapping[str, Any]:
     """Let the node load the setup; without sound, try again for `seconds`."""
     deadline = asyncio.get_running_loop().time() + seconds
     while True:
@@ -123,7 +97,7 @@ async def _load_tree(component: Rosafe, text: str, seconds: float) -> Mapping[st
         await asyncio.sleep(PAUSE)
 
 
-async def _create(component: Rosafe, service: str, request: Mapping[str, Any]) -> Mapping[str, Any]:
+async def _create(component: ComponentClient, service: str, request: Mapping[str, Any]) -> Mapping[str, Any]:
     """Call a service that creates processors; remove them again if the task is cancelled meanwhile."""
     answer = asyncio.ensure_future(component.node_outputs(service, request))
     try:
@@ -133,7 +107,7 @@ async def _create(component: Rosafe, service: str, request: Mapping[str, Any]) -
         raise
 
 
-async def _remove_created(component: Rosafe, answer: Awaitable[Mapping[str, Any]]) -> None:
+async def _remove_created(component: ComponentClient, answer: Awaitable[Mapping[str, Any]]) -> None:
     with contextlib.suppress(ComponentError):
         names = list((await answer)["created"])
         for end in range(len(names), 0, -MAX_SEQUENCE):
@@ -156,7 +130,7 @@ async def _finish(work: Awaitable[object]) -> None:
 # --- sound ------------------------------------------------------------------------------------------------------
 
 
-async def _topic(component: Rosafe, setup: Setup, connected: str) -> str:
+async def _topic(component: ComponentClient, setup: Setup, connected: str) -> str:
     """Return the topic for the Audio port; empty if the setup has none and the default topic is not published."""
     if AUDIO in setup.connections:
         return ros_names.resolve(setup.connections[AUDIO], component.node)
@@ -165,7 +139,7 @@ async def _topic(component: Rosafe, setup: Setup, connected: str) -> str:
 
 
 @contextlib.asynccontextmanager
-async def _bass(component: Rosafe, topic: str) -> AsyncIterator[Services | None]:
+async def _bass(component: ComponentClient, topic: str) -> AsyncIterator[ComponentClient | None]:
     """Yield the bass component that publishes `topic`; None if another node publishes it."""
     node, _, port = topic.rpartition("/")
     if not node or port != AUDIO:
@@ -176,11 +150,11 @@ async def _bass(component: Rosafe, topic: str) -> AsyncIterator[Services | None]
             bass = await stack.enter_async_context(component.other(node))
         except ComponentError:
             bass = None
-        yield bass if bass is not None and getattr(bass, "component", BASS) is BASS else None
+        yield bass if bass is not None and bass.component is BASS else None
 
 
 @contextlib.asynccontextmanager
-async def _sound(component: Rosafe, setup: Setup, topic: str) -> AsyncIterator[str]:
+async def _sound(component: ComponentClient, setup: Setup, topic: str) -> AsyncIterator[str]:
     """Start the sound of the setup, and stop it if the block ends with an exception.
 
     Yields "started", "reused" if bass acquires already, or "" if the setup has no sound.
@@ -211,7 +185,7 @@ async def _sound(component: Rosafe, setup: Setup, topic: str) -> AsyncIterator[s
             raise
 
 
-async def _stop(bass: Services, acquired: Awaitable[object]) -> None:
+async def _stop(bass: ComponentClient, acquired: Awaitable[object]) -> None:
     with contextlib.suppress(ComponentError):
         await acquired
         await bass.outputs("Stop", {})

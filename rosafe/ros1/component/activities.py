@@ -6,7 +6,6 @@ import errno
 import itertools
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -14,8 +13,6 @@ from rosafe.declarations.text import join_names
 from rosafe.interface import MAX_ACTIVITIES, ComponentError, Service
 
 Handler = Callable[["Activity", dict[str, Any]], None]
-
-LOAD_SECONDS = 1.0  # minimum time over which the load is measured; in less, one cycle would look like overload
 
 
 class Activity:
@@ -79,56 +76,6 @@ def too_many(task: str) -> ComponentError:
 def unexpected_error(problem: BaseException) -> ComponentError:
     """The exception of a request whose handler failed unexpectedly."""
     return ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
-
-
-class TaskStatistics:
-    """Measurements of one task of the component: number and duration of its cycles, and its load.
-
-    The load is the time spent in cycles divided by the elapsed time. It can exceed 1 if a task has several processors.
-
-    Attributes
-    ----------
-    cycle : callable
-        Count a cycle of some seconds. It may be called from any thread, thousands of times per second.
-    """
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self.load = self.load_max = 0.0
-        self._pending: deque[float] = deque()  # the cycles since the last snapshot, of which there is one per second
-        self.cycle: Callable[[float], None] = self._pending.append
-        self._cycles = 0
-        self._last = self._longest = self._total = self._busy = 0.0
-        self._since = self._start = time.monotonic()
-        self._lock = threading.Lock()
-
-    def _count_pending(self) -> None:
-        for _ in range(len(self._pending)):
-            self._last = self._pending.popleft()
-            self._longest = max(self._longest, self._last)
-            self._total += self._last
-            self._busy += self._last
-            self._cycles += 1
-
-    def snapshot(self) -> dict[str, Any]:
-        """Return the member `rusage` of genom_state: timings in seconds, and the load of about the last second."""
-        with self._lock:
-            self._count_pending()
-            now = time.monotonic()
-            if now - self._since >= LOAD_SECONDS:
-                self.load = self._busy / (now - self._since)
-                self.load_max = max(self.load_max, self.load)
-                self._busy, self._since = 0.0, now
-            average = self._total / self._cycles if self._cycles else 0.0
-            return {
-                "cycles": self._cycles % 2**32,
-                "timings": {"last": self._last, "max": self._longest, "avg": average},
-                "load": {
-                    "last": self.load,
-                    "max": self.load_max,
-                    "avg": self._total / max(now - self._start, 1e-9),
-                },
-            }
 
 
 class Activities:

@@ -22,12 +22,13 @@ from rosafe import interface
 from rosafe.declarations.text import short_repr
 from rosafe.interface import ComponentError
 from rosafe.ros1.component.action_server import GoalHandler, StatusPublisher
-from rosafe.ros1.component.activities import Activities, Activity, Handler, TaskStatistics, unexpected_error
+from rosafe.ros1.component.activities import Activities, Activity, Handler, unexpected_error
 from rosafe.ros1.component.explicit_defaults import has_explicit_defaults, warning_exdetail
 from rosafe.ros1.component.request_dispatcher import STOP_WAIT, RequestDispatcher, Values, report_error
 from rosafe.ros1.component.state_publisher import Diagnostics, StatePublisher
 from rosafe.ros1.transport import master, registration
 from rosafe.ros1.transport.publisher import Publisher
+from rosafe.tree.health import TaskStatistics
 
 UP_SECONDS = 10.0  # to register a node that starts at the master
 SEND_SECONDS = 0.1  # for responses and results: rospy sends them on its own threads, and does not report when

@@ -17,9 +17,10 @@ import rospy
 
 from rosafe import interface
 from rosafe.ros1.component import malloc_tuning
-from rosafe.ros1.component.activities import Activities, TaskStatistics
+from rosafe.ros1.component.activities import Activities
 from rosafe.ros1.transport import systemd
 from rosafe.system.version import VERSION
+from rosafe.tree.health import TaskStatistics
 
 STATE_PERIOD = 0.9  # s between two genom_state messages at most; the contract is 1
 BURST_SECONDS = 0.005  # changes within this time are published in one message

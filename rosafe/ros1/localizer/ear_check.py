@@ -9,6 +9,7 @@ import numpy as np
 
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.head_check import HeadCheck
 from rosafe.localization.live import NewFrames
 from rosafe.ros1.localizer.measurement import FrameListener, ear_levels
 
@@ -21,7 +22,9 @@ ABOVE_QUIET_DB = 10.0  # of a frame, in one ear
 SILENT_DB = 3.0  # an ear that is not above its level in quiet by more is silent
 SILENT_DIFFERENCE_DB = 40.0  # between the ears, with sound from ahead: the weaker one is silent
 MIN_SIDE_MS, MIN_SIDE_DB = 0.2, 3.0  # between a sound from the left and one from the right
-MAX_GAIN_DB = 3.0
+MAX_GAIN_DB = 2.0
+ORDINARY_SECONDS = 60.0  # of ordinary sound
+UNQUIET_DB = 15.0  # between the soft and the loud frames at the beginning: it is not quiet
 LOW_CHANNELS = 0.4  # of the channels: the time difference is that of the low frequencies
 CURRENT_COHERENCE = 0.9  # of a frame whose time difference counts
 
@@ -93,9 +96,10 @@ def assess(heard: Mapping[str, HeardSound]) -> EarReport:
     problems = _order_problems(heard["left"], heard["right"])
     if not problems:
         lines.append("ears: the left and the right one are not swapped")
-    gain = heard["ahead"].difference_db
+    left, ahead, right = (heard[direction].difference_db for direction in DIRECTIONS)
+    gain = ahead / 2 + (left + right) / 4
     louder, weaker = ("left", "right") if gain > 0 else ("right", "left")
-    lines.append(f"gain: the {louder} ear is {abs(gain):.1f} dB louder with sound from ahead")
+    lines.append(f"gain: the {louder} ear is {abs(gain):.1f} dB louder")
     if abs(gain) > MAX_GAIN_DB:
         problems.append(
             f"the gains differ by {abs(gain):.1f} dB: raise that of the {weaker} ear, or lower that of the {louder} one"
@@ -144,13 +148,20 @@ def check_ears(listener: FrameListener, say: Callable[[str], None]) -> EarReport
         rosAFE computes no frames.
     """
     say(f"quiet, please: for {QUIET_SECONDS:g} s")
-    levels = [ear_levels(*item) for item in listener.listen(QUIET_SECONDS)]
-    quiet = np.median(np.concatenate(levels), axis=0)
+    levels = np.concatenate([ear_levels(*item) for item in listener.listen(QUIET_SECONDS)])
+    if np.ptp(np.quantile(levels, (0.1, 0.9), axis=0), axis=0).max() > UNQUIET_DB:
+        say("it is not quiet: the sound of this place is used")
+        return check_ordinary(listener, ORDINARY_SECONDS, say)
+    quiet = np.median(levels, axis=0)
     heard = {}
+    loud, everything = _Checked(), _Checked()
     for direction in DIRECTIONS:
         where = "straight ahead of the head" if direction == "ahead" else f"the {direction} of the head"
         say(f"now a sound from {where}: speak, clap or rattle, about a metre away")
-        sound = _next_sound(listener, quiet)
+        sound = _next_sound(listener, quiet, loud, everything)
+        if sound is None and (ordinary := everything.report()) is not None:
+            say("no sound was louder than the sound of this place, which is used")
+            return ordinary
         if sound is None:
             say(f"no sound was heard from {where} for {WAIT_SECONDS:g} s: both ears are silent, or it was too soft")
             return None
@@ -158,7 +169,45 @@ def check_ears(listener: FrameListener, say: Callable[[str], None]) -> EarReport
         say(_line(direction, sound))
         if direction != DIRECTIONS[-1]:
             _wait_for_pause(listener, quiet)
-    return assess(heard)
+    report, cues = assess(heard), loud.report()
+    if report.problems or cues is None:
+        return report
+    return EarReport((*report.lines, *cues.problems), cues.problems)
+
+
+def check_ordinary(listener: FrameListener, seconds: float, say: Callable[[str], None]) -> EarReport | None:
+    """Return the report on ordinary sound or a walk around the head; None if there was too little.
+
+    Parameters and errors are those of `check_ears`; `seconds` is the time to listen.
+    """
+    say(f"listening for {seconds:g} s: walk once around the head and speak, first to its left, or let people talk")
+    checked = _Checked()
+    for model, frames in listener.listen(seconds):
+        checked.update(model, frames)
+    report = checked.report()
+    if report is None:
+        say("there was too little sound from one direction at a time: repeat it, closer or louder")
+    return report
+
+
+class _Checked:
+    """The check of the cues of frames, as soon as there are some."""
+
+    def __init__(self) -> None:
+        self._check: HeadCheck | None = None
+
+    def update(self, model: DirectionModel, frames: NewFrames) -> None:
+        """Add frames."""
+        self._check = self._check or HeadCheck(model)
+        self._check.update(frames.features)
+
+    def report(self) -> EarReport | None:
+        """Return the report; None without enough sound."""
+        found = self._check.report() if self._check is not None else None
+        if found is None:
+            return None
+        problems = (found.problem,) if found.problem else ()
+        return EarReport((*found.lines, *problems), problems)
 
 
 def _is_loud(levels: FloatArray, quiet: FloatArray) -> np.ndarray:
@@ -166,12 +215,16 @@ def _is_loud(levels: FloatArray, quiet: FloatArray) -> np.ndarray:
     return np.asarray((levels - quiet > ABOVE_QUIET_DB).any(axis=1))
 
 
-def _next_sound(listener: FrameListener, quiet: FloatArray) -> HeardSound | None:
-    """Return the next half second of sound, which may have pauses; None if there is none."""
+def _next_sound(
+    listener: FrameListener, quiet: FloatArray, checked: _Checked, everything: _Checked
+) -> HeardSound | None:
+    """Return the next half second of sound, which may have pauses, and check its cues; None if there is none."""
     loud: list[tuple[DirectionModel, NewFrames]] = []
     listener.discard()
     for model, frames in listener.listen(WAIT_SECONDS):
         loud.append((model, frames.select(_is_loud(ear_levels(model, frames), quiet))))
+        checked.update(*loud[-1])
+        everything.update(model, frames)
         if sum(len(part.middles) for _, part in loud) >= SOUND_FRAMES:
             joined = NewFrames.joined([part for _, part in loud])
             return heard_sound(

@@ -18,11 +18,10 @@ from rosafe.localization import cues
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.live import OK, NewFrames, StreamRestartedError
 from rosafe.localization.noise import NoiseCalibration, measured_level
+from rosafe.localization.settings import LocalizerSettings, Models
 from rosafe.ros import FrameClock
 from rosafe.ros1.localizer.frame_source import PortSource
-from rosafe.ros1.localizer.node import Models
-from rosafe.ros1.localizer.settings import LocalizerSettings
-from rosafe.ros1.localizer.status import NodeStatus
+from rosafe.ros1.localizer.status import node_status
 from rosafe.ros1.localizer.tree_link import LocalizerPorts, TreeLink
 from rosafe.system.terminal import printable
 
@@ -52,7 +51,7 @@ class FrameListener:
     """
 
     def __init__(self, settings: LocalizerSettings) -> None:
-        self._status = NodeStatus(lambda: None)
+        self._status = node_status(lambda: None)
         models = Models(settings)
         models.report = self._report_learning
         afe = rospy.resolve_name(settings.rosafe)
@@ -122,7 +121,7 @@ class FrameListener:
 
 def levels_of(model: DirectionModel, frames: NewFrames) -> FloatArray:
     """Return the level (F, C) of frames of both ears in dB, as in `rosafe.localization.cues`."""
-    return cues.quantize(frames.features, cues.scaling_db(model.parameters)).level
+    return cues.quantize(frames.features, cues.scaling_db(model.parameters), model.max_itd).level
 
 
 def ear_levels(model: DirectionModel, frames: NewFrames) -> FloatArray:

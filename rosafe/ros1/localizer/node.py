@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import functools
-import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import rospy
@@ -13,20 +12,21 @@ from std_msgs.msg import Bool
 
 from rosafe.declarations.errors import ComponentError
 from rosafe.localization.direction_model import DirectionModel
-from rosafe.localization.head import Head
 from rosafe.localization.live import OK, FixedHead, FrameQueue, LocalizationLoop, Mute, TransformedHead
-from rosafe.localization.localizer import SPHERE, Localizer, find_model
+from rosafe.localization.live_streams import LiveStreams
+from rosafe.localization.localizer import Localizer
+from rosafe.localization.settings import LocalizerSettings, Models
+from rosafe.localization.stored_noise import StoredNoise
 from rosafe.ros import FrameClock
 from rosafe.ros1.component.state_publisher import Diagnostics
 from rosafe.ros1.localizer.frame_source import PortSource
-from rosafe.ros1.localizer.noise import StoredNoise
 from rosafe.ros1.localizer.publishers import Publishers
-from rosafe.ros1.localizer.settings import LocalizerSettings, read_settings
-from rosafe.ros1.localizer.status import NodeStatus
+from rosafe.ros1.localizer.settings import read_settings
+from rosafe.ros1.localizer.sound import InputSound
+from rosafe.ros1.localizer.status import node_status
 from rosafe.ros1.localizer.transforms import TransformBuffer
 from rosafe.ros1.localizer.tree_link import LocalizerPorts, TreeLink
 from rosafe.ros1.transport import registration
-from rosafe.system.terminal import printable
 
 UP_SECONDS = 10.0  # to register a node that starts at the master
 PROGRESS_STEP = 0.1  # of the part of a head that is learned, between two lines in the log
@@ -49,7 +49,7 @@ class LocalizerNode:
     def __init__(self, options: Mapping[str, Any]) -> None:
         self.finished = threading.Event()
         self._diagnostics = Diagnostics(self.finished)
-        self._status = NodeStatus(self._diagnostics.changed)
+        self._status = node_status(self._diagnostics.changed)
         try:
             settings = read_settings(options)
             self._models = Models(settings)
@@ -66,19 +66,25 @@ class LocalizerNode:
         self._clock = FrameClock(afe)
         names = settings.world_frame, settings.head_frame, settings.audio_delay
         head = FixedHead() if self._transforms is None else TransformedHead(self._transforms, *names, self._status)
+        publishers = Publishers(settings.frame_id, settings.speech_only)
+        self._streams = publishers.streams = LiveStreams(
+            publishers.publish_part, publishers.has_stream_subscribers, publishers.has_speech_subscribers, self._status
+        )
         self._loop = LocalizationLoop(
             functools.partial(_localizer, settings.seconds, noise),
-            Publishers(settings.frame_id),
+            publishers,
             FrameQueue(head, mute),
             self._status,
             lambda: self._link.check_now(),
             rospy.get_time,
+            self._streams.update,
         )
         self._link = TreeLink(
             afe, settings.connect, self._models.model_for, self._connect, self._status, self._loop.is_stalled
         )
         registration.registrar().settle(UP_SECONDS)
         self._loop.start()
+        self._streams.start()
         self._link.start()
         threading.Thread(target=self._diagnostics.run, name="diagnostics", daemon=True).start()
 
@@ -89,6 +95,7 @@ class LocalizerNode:
             self._diagnostics.changed()
             self._link.close()
             self._loop.close()
+            self._streams.close()
             if self._transforms is not None:
                 self._transforms.close()
             self._mute.unregister()
@@ -96,7 +103,10 @@ class LocalizerNode:
     def _connect(self, ports: LocalizerPorts | None) -> None:
         if ports is None:
             self._loop.connect(None)
+            self._streams.connect(None)
         else:
+            open_sound = functools.partial(InputSound, ports.audio, ports.format.sample_rate, self._clock, self._status)
+            self._streams.connect(ports.model, open_sound)
             self._loop.connect(ports.model, functools.partial(PortSource, ports.topics, ports.format, self._clock))
 
     def _report_learning(self, part: float) -> None:
@@ -126,37 +136,3 @@ def _transforms(settings: LocalizerSettings) -> TransformBuffer | None:
             f"world_frame: expected the Python modules of tf2 ({problem}); run scripts/install",
         ) from None
     return transforms
-
-
-class Models:
-    """The models of one head, by sample rate.
-
-    Parameters
-    ----------
-    settings : LocalizerSettings
-
-    Raises
-    ------
-    ValueError
-        The file of the head is unsuitable.
-    """
-
-    def __init__(self, settings: LocalizerSettings) -> None:
-        self.report: Callable[[float], None] = lambda part: None  # of the progress
-        self._parameters = settings.parameters or None
-        self._head: Any = SPHERE
-        path = os.path.expanduser(settings.head)
-        if path.lower().endswith(".sofa"):
-            self._head = Head.from_sofa(path, settings.mirror)
-        elif settings.mirror is not None:
-            raise ValueError(f"mirror: expected a SOFA file as the head, got {settings.head!r}; unset mirror")
-        elif settings.head != "sphere":
-            self._head = DirectionModel.load(path)
-
-    def model_for(self, sample_rate: float) -> DirectionModel:
-        """Return the model for a sample rate. It is learned if there is none, which takes up to 30 s on two cores."""
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)  # of this thread only: sound comes first
-        try:
-            return find_model(self._head, sample_rate, self._parameters, self.report)
-        except ValueError as problem:
-            raise ValueError(printable(str(problem))) from None

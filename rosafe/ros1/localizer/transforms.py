@@ -9,7 +9,7 @@ from typing import Any
 
 import rospy
 
-from rosafe.ros1.transport.log_throttle import ThrottledLog
+from rosafe.system.log_throttle import ThrottledLog
 from rosafe.system.terminal import printable
 
 CACHE_SECONDS = 10.0  # of transforms

@@ -17,19 +17,21 @@ from typing import Any
 
 import rospy
 
+from rosafe.audio.files.windows import MAX_WINDOW
 from rosafe.declarations import ros_names
 from rosafe.dsp.framing import FrameGrid
 from rosafe.interface import BLOCK_AND_BUFFERS, REQUEST, ROSAFE, ComponentError, format_value
 from rosafe.localization import cues
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.live import OK, WARN, FrameFormat
+from rosafe.localization.status import NodeStatus
 from rosafe.ros1.client.component_client import ComponentClient
 from rosafe.ros1.client.graph import Graph, NotRegisteredError
 from rosafe.ros1.client.tcpros import ServiceClient, component_exception
+from rosafe.ros1.component import serialization
 from rosafe.ros1.localizer.created_processors import CreatedProcessors
-from rosafe.ros1.localizer.status import NodeStatus
 from rosafe.ros1.transport import registration
-from rosafe.ros1.transport.log_throttle import ThrottledLog
+from rosafe.system.log_throttle import ThrottledLog
 from rosafe.system.terminal import printable
 from rosafe.tree.tree_planner import ExistingProcessor
 
@@ -57,11 +59,14 @@ class LocalizerPorts:
         Of their frames.
     topics : mapping
         By representation.
+    audio : str
+        The topic of the sound.
     """
 
     model: DirectionModel
     format: FrameFormat
     topics: Mapping[str, str]
+    audio: str
 
 
 class _Waiting(Exception):
@@ -226,7 +231,8 @@ class TreeLink:
         block = int(root.values["nFramesPerBlock"])
         grid = FrameGrid.design(rate, "cc", model.parameters)
         _report_block(self._status, block, grid.hop, rate)
-        return LocalizerPorts(model, FrameFormat(rate, model.channels, len(grid.window), grid.hop, block), topics)
+        format_ = FrameFormat(rate, model.channels, len(grid.window), grid.hop, block)
+        return LocalizerPorts(model, format_, topics, await self._audio_topic(client))
 
     async def _model_of_input(self, graph: Graph, service: ServiceClient, client: ComponentClient) -> DirectionModel:
         """Return the model for the input, which is created if there is none, or if the rate of the sound differs."""
@@ -268,12 +274,16 @@ class TreeLink:
 
     async def _sound_rate(self, client: ComponentClient) -> int:
         """Return the sample rate of the sound, 0 if there is none: rosAFE logs requests that fail for want of it."""
-        topic = self._connect or await client.port_connected("Audio") or REQUEST.parameter("connect").default
-        topic = rospy.resolve_name(ros_names.resolve(topic, self._instance))
+        topic = await self._audio_topic(client)
         rate = await sound_rate(topic, SOUND_SECONDS)
         if not rate:
             self._status.set("rosAFE", WARN, f"waiting for sound on {topic}")
         return rate
+
+    async def _audio_topic(self, client: ComponentClient) -> str:
+        """Return the topic of the sound."""
+        topic = self._connect or await client.port_connected("Audio") or REQUEST.parameter("connect").default
+        return str(rospy.resolve_name(ros_names.resolve(topic, self._instance)))
 
     async def _model(self, rate: float) -> DirectionModel:
         try:
@@ -343,9 +353,11 @@ async def sound_rate(topic: str, seconds: float) -> int:
     rates: list[int] = []  # of messages: the first one may be an old one of a latched topic
 
     def received(message: Any) -> None:
-        rates.append(int.from_bytes(message._buff[:4], "little"))  # the message begins with it
+        rates.append(0 if message.problem else int(message.sampleRate))
 
-    subscriber = rospy.Subscriber(topic, rospy.AnyMsg, received, queue_size=1)
+    # rospy has one message class for each topic of a process, which `InputSound` may use at the same time
+    message_class = serialization.tolerant_message_class("rosAFE", "::binaudio::portStruct", MAX_WINDOW)
+    subscriber = rospy.Subscriber(topic, message_class, received, queue_size=1)
     try:
         until = time.monotonic() + seconds
         while len(rates) < 2 and time.monotonic() < until:

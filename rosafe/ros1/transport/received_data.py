@@ -25,7 +25,7 @@ from rospy.msg import deserialize_messages
 from rosafe.interface import MAX_SEQUENCE, MAX_STRING
 from rosafe.ros1.transport import master
 from rosafe.ros1.transport.handshake_server import HandshakeRejected
-from rosafe.ros1.transport.log_throttle import ThrottledLog
+from rosafe.system.log_throttle import ThrottledLog
 
 HEADER_BYTES = 65536  # a TCPROS header, which contains the definition of a message
 # Requests up to this length, and audio messages up to this much above their limit, are read even if they are invalid,

@@ -24,10 +24,9 @@ from rosafe.system.version import VERSION
 from rosafe.web.genomix import binary_format
 from rosafe.web.genomix.sessions import Request, Session, Sessions
 from rosafe.web.genomix.text_formats import JSON, SYNTAXES, TCL, Syntax, plain, structure
-from rosafe.web.server.access import check_host, check_no_browser, host_name
+from rosafe.web.server.access import HttpRefusal, check_host, check_no_browser, host_name
 from rosafe.web.server.connections import Connections, Limits
 from rosafe.web.server.listener import HttpListener, connection_of
-from rosafe.web.server.refusal import HttpRefusal
 
 MAX_WAIT_MS = 3_600_000
 FORMATTERS = 4  # threads

@@ -6,8 +6,7 @@ import hmac
 import secrets
 from collections.abc import Collection, Mapping
 
-from rosafe.web.server.access import check_host, check_same_origin, host_name
-from rosafe.web.server.refusal import HttpRefusal
+from rosafe.web.server.access import HttpRefusal, check_host, check_same_origin, host_name
 
 HEADERS = {
     "Content-Security-Policy": (

@@ -80,9 +80,6 @@ class ComponentFacade:
 
     async def build(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Build a representation with all processors that it needs, or find it, as `rosafe request` does."""
-        kind = KINDS.get(str(values.get("representation", "")))
-        if kind is not None:
-            values = {**values, "representation": kind.word}
         return await self._call(REQUEST, values)
 
     async def build_default_tree(self, _: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from rosafe.web.live.audio import Audio
 
 RATE = 10.0  # columns per second, as the localizer publishes
 MAX_SOURCES = 8  # of the localizer, and of a scene
-SOURCE_NUMBERS = 4  # id, azimuth and its standard deviation (degrees), probability
+SOURCE_NUMBERS = 5  # id, azimuth and its standard deviation (degrees), probabilities that it exists and that it speaks
 MAX_DIRECTIONS = 3600  # of a posterior
 MAX_HOLD = 5  # columns without a message that are filled with the following one
 TRUTH_SECONDS = 0.1  # largest difference of the time of a truth and of an estimate
@@ -143,5 +143,5 @@ def source_slots(message: Any) -> np.ndarray:
     slots = np.full((MAX_SOURCES, SOURCE_NUMBERS), np.nan)
     sources = sorted(message.sources, key=lambda one: -one.probability)[:MAX_SOURCES]
     for slot, one in zip(slots, sources, strict=False):
-        slot[:] = one.id % 2**24, np.degrees(one.azimuth), np.degrees(one.azimuth_std), one.probability
+        slot[:] = one.id % 2**24, np.degrees(one.azimuth), np.degrees(one.azimuth_std), one.probability, one.speech
     return slots.ravel()

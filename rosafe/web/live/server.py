@@ -21,9 +21,9 @@ from rosafe.web.live.client import BrowserConnection
 from rosafe.web.live.components import Action, ComponentFacade, catalogue, format_error
 from rosafe.web.live.health import Health
 from rosafe.web.live.views import Hub
+from rosafe.web.server.access import HttpRefusal
 from rosafe.web.server.connections import Connections, Limits
 from rosafe.web.server.listener import HttpListener, connection_of
-from rosafe.web.server.refusal import HttpRefusal
 
 PAGE = Path(__file__).with_name("page")
 POLL_SECONDS = 1.0  # between two requests to the components, while a page is open

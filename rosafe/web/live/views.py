@@ -216,16 +216,12 @@ class Hub:
         if key.what == "levels":
             view = View(6, 20.0, FLOAT, {"mode": "levels", "rows": 3, "ears": 2, "rate": 20.0})
             self._views[key] = view
-            self.audio = Audio(f"{self._bass}/Audio", partial(_append_levels, view, self._on_new_columns))
+            self.audio = Audio(f"{self._bass}/Audio", partial(self._append_levels, view))
             return
         if key.what == "directions":
             self._views[key] = view = View(directions.SIZE, directions.RATE, FLOAT, directions.description())
-            self._directions = directions.DirectionTopics(
-                lambda: self.audio,
-                partial(_append_directions, view, self._on_new_columns),
-                self._bass,
-                self._localizer,
-            )
+            use = partial(self._append, view)
+            self._directions = directions.DirectionTopics(lambda: self.audio, use, self._bass, self._localizer)
             return
         processor = self.tree.processors.get(key.name)
         if processor is None or not self.tree.sample_rate:
@@ -246,6 +242,17 @@ class Hub:
         if captured is not None:
             self.latencies[topic] = time.time() - captured
         columns.append(frames)
+        self._on_new_columns()
+
+    def _append_levels(self, view: View, samples: np.ndarray, end: float) -> None:
+        """Append the levels of the audio to a view: peak and RMS (dBFS) and the clipped samples of each ear."""
+        meter = LevelMeter()
+        meter.add(samples)
+        column = [number for ear in range(2) for number in (meter.peak(ear), meter.rms(ear), float(meter.clipped[ear]))]
+        self._append(view, view.next, np.array(column, np.float32)[:, np.newaxis], end)
+
+    def _append(self, view: View, first: int, columns: np.ndarray, end: float) -> None:
+        view.append(first, columns, end)
         self._on_new_columns()
 
     # --- changes of the tree ---
@@ -281,22 +288,6 @@ def _dependencies(key: Key, tree: TreeSnapshot) -> list[Any]:
     processor = tree.processors.get(key.name)
     dependencies: list[Any] = [tree.sample_rate]
     return dependencies + [(ancestor, dict(ancestor.values)) for ancestor in tree.ancestors(processor)]
-
-
-def _append_levels(view: View, on_new_columns: Callable[[], None], samples: np.ndarray, end: float) -> None:
-    """Append the levels of the audio to a view: peak and RMS (dBFS) and the number of clipped samples of each ear."""
-    meter = LevelMeter()
-    meter.add(samples)
-    column = [number for ear in range(2) for number in (meter.peak(ear), meter.rms(ear), float(meter.clipped[ear]))]
-    view.append(view.next, np.array(column, np.float32)[:, np.newaxis], end)
-    on_new_columns()
-
-
-def _append_directions(
-    view: View, on_new_columns: Callable[[], None], first: int, columns: np.ndarray, end: float
-) -> None:
-    view.append(first, columns, end)
-    on_new_columns()
 
 
 assert MAX_COLUMN_RATE * HISTORY_SECONDS < 2**16  # columns of a piece are a uint16

@@ -1,4 +1,4 @@
-"""Checks of the headers Host and Origin: names of this machine only, and no pages from other servers."""
+"""Refused requests; checks of the headers Host and Origin: names of this machine only, no pages of other servers."""
 
 from __future__ import annotations
 
@@ -8,9 +8,22 @@ import re
 import socket
 from collections.abc import Collection, Mapping
 
-from rosafe.web.server.refusal import HttpRefusal
-
 _HOST = re.compile(r"(?:\[(?P<address>[0-9A-Fa-f:.]+)\]|(?P<name>[\w-]+(?:\.[\w-]+)*)\.?)(?::[0-9]{0,5})?", re.ASCII)
+
+
+class HttpRefusal(Exception):
+    """A refused request or connection; the text is one line for the client.
+
+    Parameters
+    ----------
+    status : int
+        HTTP status: 403 (not allowed), 503 (a limit is reached), or another one from 400 on.
+    reason : str
+    """
+
+    def __init__(self, status: int, reason: str) -> None:
+        super().__init__(reason)
+        self.status = status
 
 
 def check_no_browser(headers: Mapping[str, str]) -> None:

@@ -24,7 +24,7 @@ from typing import Any, cast
 
 from aiohttp import web
 
-from rosafe.web.server.refusal import HttpRefusal
+from rosafe.web.server.access import HttpRefusal
 
 BUFFER = 4 * 1024  # bytes of a request that are not counted; bytes read at a time
 HEADERS_SIZE = 64 * 1024  # bytes of all headers of a request

@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 import rosgraph
 from rosgraph.network import encode_ros_handshake_header, read_ros_handshake_header
 
-from rosafe.ros1.transport import log_throttle
+from rosafe.system import log_throttle
 from tests.harness import PATIENCE, Graph, Process, proc, wait_for
 
 WELL_SECONDS = 4.0  # for any call of a healthy node; silent clients block a faulty one for 5 s or more

@@ -11,7 +11,8 @@ import pytest
 
 from rosafe.interface import BASS, MAX_ACTIVITIES, ROSAFE, ComponentError
 from rosafe.ros1.component import activities as module
-from rosafe.ros1.component.activities import Activities, Activity, TaskStatistics
+from rosafe.ros1.component.activities import Activities, Activity
+from rosafe.tree.health import TaskStatistics
 from tests.harness import PATIENCE
 
 INPUT = ROSAFE.service("InputProc")  # interrupts its own kind

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from rosafe.audio.files.windows import MAX_RATE
-from rosafe.ros1.component.audio import PAUSE_SECONDS, RING_SECONDS, AudioReader, AudioRing, Counters
+from rosafe.audio.stream.ring import PAUSE_SECONDS, RING_SECONDS, AudioReader, AudioRing, Counters
 from tests.harness import PATIENCE, ROOT
 
 RATE = 8  # Hz: the ring contains 80 frames
@@ -62,7 +62,7 @@ def opened(ring: AudioRing, block: int) -> AudioReader:
 
 
 class Model:
-    """The rules in the docstring of rosafe/ros1/component/audio.py, with a dict from frame index to sample."""
+    """The rules in the docstring of rosafe/audio/stream/ring.py, with a dict from frame index to sample."""
 
     def __init__(self) -> None:
         self.rate = self.window = self.newest = 0
@@ -453,7 +453,7 @@ def test_unobserved_blocks_are_read_together() -> None:
 
 def test_unobserved_blocks_are_read_when_the_sound_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
-    monkeypatch.setattr("rosafe.ros1.component.audio.time.monotonic", lambda: now)
+    monkeypatch.setattr("rosafe.audio.stream.ring.time.monotonic", lambda: now)
     ring = AudioRing(print)
     feed, source = ring.connect(), Source(rate=1000, window=16)
     feed(source.message())

@@ -14,8 +14,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from rosAFE.msg import rosAFE_frameTime, rosAFE_TimeFrequencySignalPortStruct
 
+from rosafe.audio.stream.frame_clock import FrameTime
 from rosafe.ros import FrameClock, array_msg
-from rosafe.ros1.component.frame_clock import FrameTime
 from tests.harness import Graph, wait_for
 from tests.ros1.afe.session import Microphone, Session, noise
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosafe.ros1.component.audio import BLOCK_SIZES, LAG_SECONDS, LagMonitor
+from rosafe.audio.stream.ring import BLOCK_SIZES, LAG_SECONDS, LagMonitor
 from tests.harness import Graph, Process, wait_for
 from tests.ros1.afe.session import own_node
 

@@ -6,7 +6,7 @@ import itertools
 import re
 import time
 
-from rosafe.ros1.transport.log_throttle import MAX_KINDS, ThrottledLog
+from rosafe.system.log_throttle import MAX_KINDS, ThrottledLog
 from tests.harness import run_together, wait_for
 
 

@@ -26,7 +26,7 @@ from tests.ros1.afe.session import Session, error_of
 STALLING = """
 import sys, threading
 from pathlib import Path
-from rosafe.ros1.component import audio
+from rosafe.audio.stream import ring as audio
 from rosafe.ros1.afe import node, published_tree
 where, folder = sys.argv.pop(1), Path(sys.argv.pop(1))
 

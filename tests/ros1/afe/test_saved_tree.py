@@ -23,7 +23,7 @@ from rosafe.interface import ComponentError
 from rosafe.ros1.afe.audio_input import AudioInput
 from rosafe.ros1.afe.saved_tree import SavedTree
 from rosafe.ros1.transport import registration
-from rosafe.setups import Setup, read
+from rosafe.tree.setups import Setup, read
 from rosafe.tree.tree_builder import Planner
 from tests.harness import PATIENCE, Graph, MasterProcess, wait_for
 from tests.ros1.afe.session import Microphone, Session, noise, own_node

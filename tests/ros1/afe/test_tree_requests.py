@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from rosafe.setups import read
+from rosafe.tree.setups import read
 from tests.harness import Graph, run_together
 from tests.ros1.afe.session import RATE, Microphone, Session, noise, own_node
 
@@ -128,7 +128,7 @@ def test_without_audio_nothing_is_created(graph: Graph) -> None:
         microphone.close()
 
 
-HOSTILE = {  # all others: tests/setups
+HOSTILE = {  # all others: tests/tree/setups
     "fb_nChannels: !!python/object/apply:os.system ['touch MARK']": "tags",
     "fb_cfHz: &a [100, 200], rm_wname: *a": "anchors",
     "{fb_cfHz: " * 20_000: "nested too deeply",

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe.audio.devices import Chunk
+from rosafe.audio.stream import capture as capture_module
+from rosafe.audio.stream.capture import MAX_WINDOW, AudioWindow, Capture, Snapshot, check_window
 from rosafe.interface import ComponentError
-from rosafe.ros1.bass import capture as capture_module
-from rosafe.ros1.bass.capture import MAX_WINDOW, AudioWindow, Capture, Snapshot, check_window
 
 
 @settings(max_examples=40)
@@ -132,7 +132,7 @@ def test_lack_of_memory_is_a_named_error(monkeypatch: pytest.MonkeyPatch) -> Non
     def refuse(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("rosafe.ros1.bass.capture.np.zeros", refuse)
+    monkeypatch.setattr("rosafe.audio.stream.capture.np.zeros", refuse)
     with pytest.raises(ComponentError) as caught:
         Capture(ScriptedSource([]), 2, 3, lambda _: None, lambda _: None)
     assert caught.value.ex == "::bass::e_nomem"

@@ -205,7 +205,13 @@ def test_list_devices_prints_on_stdout(graph: Graph, bass_node: Process) -> None
     assert (answer.genom_success, answer.genom_exdetail) == (not exdetail, exdetail)
     lines = bass_node.out.splitlines()
     assert [line for line in lines if line.startswith("hw:")] == expected
-    assert [line.split(" ")[0] for line in lines][:4] == ["file:PATH", "bag:PATH", "scene:FILE.yaml", "scene:"]
+    assert [line.split(" ")[0] for line in lines][:5] == [
+        "file:PATH",
+        "bag:PATH",
+        "topic:/NAME",
+        "scene:FILE.yaml",
+        "scene:",
+    ]
 
 
 def test_common_requests(graph: Graph, bass_node: Process) -> None:

@@ -202,9 +202,9 @@ def test_topic_to_wav_and_bag(graph: Graph, capturing: Process, tmp_path: Path) 
 
 def test_topics_without_audio_are_rejected(graph: Graph, capturing: Process, tmp_path: Path) -> None:
     topics = {
-        "/recorded/genom_state": "expected /recorded/genom_state to be a port Audio, "
-        "got type bass/genom_state_component",
-        "/nobody/Audio": "/nobody/Audio: the topic has no publisher; start bass-ros",
+        "/recorded/genom_state": "topic:/recorded/genom_state: expected audio_common_msgs/AudioData, "
+        "audio_common_msgs/AudioDataStamped or a port Audio, got type bass/genom_state_component",
+        "/nobody/Audio": "topic:/nobody/Audio: the topic has no publisher; start the driver, or call Acquire of ",
     }
     with ExitStack() as stack:
         running = {

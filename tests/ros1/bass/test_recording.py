@@ -20,9 +20,8 @@ from rosafe.audio.devices.base import Chunk
 from rosafe.audio.files.audiofile import AudioFile
 from rosafe.audio.files.levels import LevelMeter
 from rosafe.commands._meter import PLAIN_SECONDS, Meter, clock
-from rosafe.ros1.bass.recording import outputs
-from rosafe.ros1.bass.recording.outputs import BagWriter, WavFile
-from rosafe.ros1.bass.recording.recorder import SoundRecorder
+from rosafe.ros1.bass import recording
+from rosafe.ros1.bass.recording import BagWriter, SoundRecorder, WavFile
 from tests.audio import bags
 
 RATE = 1000
@@ -116,7 +115,7 @@ def test_wav_that_was_not_closed_contains_all_except_the_last_second(tmp_path: P
 
 def test_long_wav_is_an_rf64(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     samples = bags.stream(3000)
-    monkeypatch.setattr(outputs, "RIFF_LIMIT", 80 - 8 + 8 * 1999)
+    monkeypatch.setattr(recording, "RIFF_LIMIT", 80 - 8 + 8 * 1999)
     file = WavFile(empty(tmp_path / "a.wav"), RATE)
     file.write(samples[:, :1999], 0)
     assert (tmp_path / "a.wav").read_bytes()[:4] == b"RIFF"
@@ -180,12 +179,16 @@ def test_bag_contains_each_frame_with_its_index_and_time(tmp_path: Path, no_paus
     assert all(message.stamp.sec * 10**9 + message.stamp.nsec == time for message, time in messages)
 
 
-def test_bag_of_less_than_a_window(tmp_path: Path, no_pauses: None) -> None:
-    samples = bags.stream(25)
+@pytest.mark.parametrize(("frames", "piece"), [(25, 25), (100, 7)])
+def test_bag_of_less_than_a_window_and_of_pieces_that_do_not_divide_it(
+    tmp_path: Path, no_pauses: None, frames: int, piece: int
+) -> None:
+    samples = bags.stream(frames)
     file = BagWriter(empty(tmp_path / "a.bag"), RATE, 10, "/bass/Audio", newest=5)
-    file.write(samples, 10**9)
+    for begin in range(0, frames, piece):
+        file.write(samples[:, begin : begin + piece], 10**9)
     file.close()
-    assert np.array_equal(play(tmp_path / "a.bag")[0][:, :25], samples)
+    assert np.array_equal(play(tmp_path / "a.bag")[0][:, :frames], samples)
 
 
 def test_bag_stops_while_there_is_space_for_its_index(
@@ -194,7 +197,7 @@ def test_bag_stops_while_there_is_space_for_its_index(
     samples = bags.stream(200)
     file = BagWriter(empty(tmp_path / "a.bag"), RATE, 10, "/bass/Audio")
     file.write(samples[:, :100], 10**9)
-    monkeypatch.setattr(outputs, "BAG_RESERVE", 2**62)
+    monkeypatch.setattr(recording, "BAG_RESERVE", 2**62)
     with pytest.raises(OSError, match="free disk space"):
         file.write(samples[:, 100:], 2 * 10**9)
     file.close()

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rospy
 
 import rosafe
-from rosafe.localization.live import OK
+from rosafe.localization.live import ERROR, OK, WARN
 from rosafe.localization.noise import FORMAT, NoiseCalibration
-from rosafe.ros1.localizer.noise import StoredNoise
-from rosafe.ros1.localizer.status import NodeStatus
+from rosafe.localization.status import NodeStatus
+from rosafe.localization.stored_noise import StoredNoise
 from tests.harness import Graph
 from tests.localization.conftest import RATE
 from tests.ros1.localizer.room import Room
@@ -37,7 +38,7 @@ def test_calibration(graph: Graph, sphere_model: Path, tmp_path: Path) -> None:
 
 class _Status(NodeStatus):
     def __init__(self) -> None:
-        super().__init__(lambda: None)
+        super().__init__(lambda: None, {OK: rospy.loginfo, WARN: rospy.logwarn, ERROR: rospy.logerr})
 
     @property
     def file(self) -> str:

@@ -10,8 +10,8 @@ from std_msgs.msg import Bool
 from rosafe.commands import localize
 from rosafe.localization.live import AFTER_SECONDS, MAX_TILT, MAX_WAIT
 from rosafe.localization.noise import MARGIN_DB
+from rosafe.localization.settings import LocalizerSettings
 from rosafe.ros1.localizer.ear_check import QUIET_SECONDS
-from rosafe.ros1.localizer.settings import LocalizerSettings
 from tests.harness import PYTHON, ROOT, Graph, wait_for
 
 TEXT = (ROOT / "docs" / "directions.md").read_text("utf-8")

@@ -3,20 +3,34 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import rosafe
+from rosafe.localization import cues
 from rosafe.localization.cues import PARAMETERS
+from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.live import NewFrames
+from rosafe.localization.settings import LocalizerSettings
 from rosafe.ros1.localizer import ear_check, measurement
-from rosafe.ros1.localizer.ear_check import DIRECTIONS, EarReport, HeardSound, assess, check_ears, heard_sound
-from rosafe.ros1.localizer.settings import LocalizerSettings
+from rosafe.ros1.localizer.ear_check import (
+    DIRECTIONS,
+    EarReport,
+    HeardSound,
+    assess,
+    check_ears,
+    check_ordinary,
+    heard_sound,
+)
 from rosafe.ros1.transport import registration
 from tests.harness import Graph, Process, wait_for
 from tests.localization.conftest import RATE, modulated
+from tests.localization.test_head_check import walk
 from tests.ros1.localizer.room import Room
 
 AZIMUTHS = {"left": 70.0, "ahead": 5.0, "right": -80.0}  # a person does not stand exactly there
@@ -93,6 +107,50 @@ def test_times_and_levels_that_contradict_each_other() -> None:
     }
     (problem,) = assess(sounds).problems
     assert "contradict" in problem
+
+
+class Sound:
+    """The frames of a sound, in place of those of a rosAFE."""
+
+    def __init__(self, sound: np.ndarray, head: Path) -> None:
+        self.model = DirectionModel.load(head)
+        self._features = rosafe.process(sound, RATE, parameters=self.model.parameters, outputs=list(cues.KINDS))
+        self._begin = 0
+
+    def discard(self) -> None:
+        """Nothing waits."""
+
+    def listen(self, seconds: float) -> Iterator[tuple[DirectionModel, NewFrames]]:
+        end = min(self._begin + round(seconds * 100), self._features["itd"].shape[1])
+        for begin in range(self._begin, end, 10):
+            self._begin = min(begin + 10, end)
+            features = {kind: np.asarray(self._features[kind])[..., begin : self._begin] for kind in cues.KINDS}
+            yield self.model, NewFrames(features, np.arange(begin, self._begin) / 100, 0)
+
+
+@pytest.mark.parametrize("ordinary", [False, True])
+def test_ordinary_sound_of_a_pair(sphere_model: Path, ordinary: bool) -> None:
+    """A place that is never quiet is noticed; also if the seconds were given."""
+    listener: Any = Sound(walk(rosafe.Head.pair(0.058)), sphere_model)
+    said: list[str] = []
+    report = check_ordinary(listener, 60.0, said.append) if ordinary else check_ears(listener, said.append)
+    assert report is not None and "--head pair:SPACING" in report.problems[0]
+    assert any("it is not quiet" in line for line in said) != ordinary
+    assert check_ordinary(Sound(np.zeros((2, RATE)), sphere_model), 60.0, said.append) is None  # type: ignore[arg-type]
+    assert "too little sound" in said[-1]
+
+
+def test_three_sounds_show_microphones_without_a_head(sphere_model: Path) -> None:
+    pause = np.zeros((2, RATE))
+    parts = [np.zeros((2, 2 * RATE))]
+    for seed, azimuth in enumerate(AZIMUTHS.values()):
+        parts += [rosafe.Head.pair(0.15).render(modulated(1.5, seed), RATE, azimuth), pause]
+    sound = np.concatenate(parts, axis=1)
+    sound += QUIET * np.random.default_rng(1).standard_normal(sound.shape)
+    listener: Any = Sound(sound, sphere_model)
+    report = check_ears(listener, lambda line: None)
+    assert report is not None and len(report.problems) == 1
+    assert report.problems[0].startswith("no level differences at high frequencies")
 
 
 def said(process: Process, text: str) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization.live import AFTER_SECONDS, FixedHead, FrameQueue, Mute, NewFrames, Rotation
-from rosafe.ros1.localizer.status import NodeStatus
+from rosafe.ros1.localizer.status import node_status
 
 
 def frames(*middles: float) -> NewFrames:
@@ -72,7 +72,7 @@ def is_muted(mute: Mute, time: float) -> bool:
 
 
 def test_a_mute_lasts_a_little_longer_and_delays_count(clock: list[float]) -> None:
-    mute = Mute(0.25, NodeStatus(lambda: None), lambda: clock[0])
+    mute = Mute(0.25, node_status(lambda: None), lambda: clock[0])
     mute.set(True)
     clock[0] = 105.0
     mute.set(False)
@@ -81,7 +81,7 @@ def test_a_mute_lasts_a_little_longer_and_delays_count(clock: list[float]) -> No
 
 
 def test_a_mute_has_ended_if_the_time_jumps_back(clock: list[float]) -> None:
-    mute = Mute(0.0, NodeStatus(lambda: None), lambda: clock[0])
+    mute = Mute(0.0, node_status(lambda: None), lambda: clock[0])
     mute.set(True)
     clock[0] = 105.0
     mute.set(False)
@@ -91,7 +91,7 @@ def test_a_mute_has_ended_if_the_time_jumps_back(clock: list[float]) -> None:
 
 
 def test_a_mute_continues_if_the_time_jumps_back(clock: list[float]) -> None:
-    status = NodeStatus(lambda: None)
+    status = node_status(lambda: None)
     mute = Mute(0.0, status, lambda: clock[0])
     mute.set(True)
     clock[0] = 1.0

@@ -15,7 +15,7 @@ from tf2_msgs.msg import TFMessage
 from rosafe.localization import angles
 from rosafe.localization.live import MAX_WAIT, OK, WARN, TransformedHead
 from rosafe.ros1.localizer import transforms
-from rosafe.ros1.localizer.status import NodeStatus
+from rosafe.ros1.localizer.status import node_status
 from rosafe.ros1.localizer.transforms import TransformBuffer
 from tests.harness import Graph, wait_for
 from tests.localization.conftest import KEMAR, RATE
@@ -42,7 +42,7 @@ class Head:
     """A head that is followed, without subscriptions."""
 
     def __init__(self, delay: float = 0.0) -> None:
-        self.status = NodeStatus(lambda: None)
+        self.status = node_status(lambda: None)
         self.transforms = TransformBuffer("world", "head")
         self.head = TransformedHead(self.transforms, "world", "head", delay, self.status)
 

@@ -19,7 +19,7 @@ from rosafe.localization.live import OK, FixedHead, FrameFormat, FrameQueue, Loc
 from rosafe.localization.localizer import Localizer
 from rosafe.processing.stream import Stream
 from rosafe.ros1.localizer.frame_source import _HEAD, PortSource
-from rosafe.ros1.localizer.status import NodeStatus
+from rosafe.ros1.localizer.status import node_status
 from tests.localization.conftest import RATE, modulated
 
 BLOCK = RATE  # 1 s
@@ -44,7 +44,7 @@ class Robot:
         )
         publishers: Any = SimpleNamespace(begin_again=lambda: None, publish=self._publish)
         mute: Any = SimpleNamespace(active=False, muted=lambda times: np.zeros(len(times), bool))
-        self.status = NodeStatus(lambda: None)
+        self.status = node_status(lambda: None)
         self.loop = LocalizationLoop(
             lambda model: Localizer(RATE, model, keep_history=False),
             publishers,

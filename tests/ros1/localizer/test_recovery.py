@@ -15,6 +15,7 @@ import pytest
 import rospy
 import yaml
 
+from rosafe.localization import cues
 from rosafe.localization.head import Head
 from tests.harness import Graph, Process, private_graph, wait_for
 from tests.localization.conftest import RATE, modulated
@@ -50,7 +51,8 @@ def test_only_its_own_processors_are_removed(
     graph: Graph, afe: Process, empty: None, device: str, sphere_model: Path
 ) -> None:
     acquire(graph, device)
-    parameters = "pp_bLevelScaling: true, pp_refSPLdB: 0, nFramesPerBlock: 1600"
+    parameters = ", ".join(f"{name}: {str(value).lower()}" for name, value in cues.PARAMETERS.items())
+    parameters += ", nFramesPerBlock: 1600"
     request = graph.call("/rosAFE/request", representation="ild", parameters=parameters, connect="")
     before = names_of(graph)
     assert set(request.dependencies) == before

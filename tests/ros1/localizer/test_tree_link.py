@@ -11,7 +11,7 @@ import pytest
 from rosafe.localization.live import WARN
 from rosafe.ros1.client.graph import NotRegisteredError
 from rosafe.ros1.localizer import tree_link
-from rosafe.ros1.localizer.status import NodeStatus
+from rosafe.ros1.localizer.status import node_status
 from tests.harness import wait_for
 
 
@@ -42,7 +42,7 @@ def test_a_node_that_the_master_does_not_know(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(tree_link, "ComponentClient", Client)
     monkeypatch.setattr(tree_link, "POLL_SECONDS", 0.01)
     monkeypatch.setattr("rospy.resolve_name", lambda name: name)
-    status = NodeStatus(lambda: None)
+    status = node_status(lambda: None)
     unused: Any = None
     link = tree_link.TreeLink("/rosAFE", "", unused, unused, status)
     link.start()
@@ -77,6 +77,6 @@ def test_a_node_that_was_replaced_leaves_its_processors_to_its_successor(
     monkeypatch.setattr(tree_link, "ComponentClient", Client)
     monkeypatch.setattr(tree_link.registration, "registrar", lambda: SimpleNamespace(is_replaced=replaced))
     unused: Any = None
-    link = tree_link.TreeLink("/rosAFE", "", unused, unused, NodeStatus(lambda: None))
+    link = tree_link.TreeLink("/rosAFE", "", unused, unused, node_status(lambda: None))
     asyncio.run(link._remove_created(unused))
     assert removed == ([] if replaced else [["ild"]])

@@ -14,7 +14,7 @@ import rospy
 
 from rosafe.localization.live import ERROR, OK, WARN, FixedHead, FrameQueue, LocalizationLoop, NewFrames
 from rosafe.ros1.localizer import tree_link
-from rosafe.ros1.localizer.status import NodeStatus
+from rosafe.ros1.localizer.status import node_status
 from tests.harness import wait_for
 
 
@@ -41,7 +41,7 @@ def test_the_link_to_rosafe_tries_again(log: list[str], monkeypatch: pytest.Monk
     monkeypatch.setattr(tree_link, "ComponentClient", Client)
     monkeypatch.setattr(tree_link, "POLL_SECONDS", 0.01)
     monkeypatch.setattr(tree_link, "MAX_PAUSE", 0.01)
-    status = NodeStatus(lambda: None)
+    status = node_status(lambda: None)
     unused: Any = None
     link = tree_link.TreeLink("/rosAFE", "", unused, unused, status)
     link.start()
@@ -65,7 +65,7 @@ class Fake:
     def __init__(self) -> None:
         self.faults: dict[str, Exception] = {}
         self.published = 0
-        self.status = NodeStatus(lambda: None)
+        self.status = node_status(lambda: None)
         self._times = itertools.count()
         azimuths = np.arange(0.0, 360.0, 5.0)
         self.localizer = namespace(
@@ -165,7 +165,7 @@ def test_messages_that_are_not_finite(fake: Fake, log: list[str]) -> None:
 
 
 def test_the_state_is_the_worst_and_among_several_the_newest() -> None:
-    status = NodeStatus(lambda: None)
+    status = node_status(lambda: None)
     states = []
     for part, level in (("a", OK), ("b", WARN), ("c", WARN), ("b", WARN), ("d", OK)):
         status.set(part, level, part, log=False)

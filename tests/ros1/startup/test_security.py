@@ -17,7 +17,7 @@ from rosafe.interface import MAX_SETUP
 from rosafe.interface.rosafe import MAX_PARAMETERS
 from rosafe.ros1.bass import socket_server
 from rosafe.ros1.transport import handshake_server, received_data, server_limits
-from rosafe.setups import markup, reading
+from rosafe.tree.setups import markup, reading
 from rosafe.web.genomix import daemon, sessions
 from rosafe.web.genomix import routes as api
 from rosafe.web.live import client, server, subscriptions, views

@@ -73,16 +73,6 @@ def test_invalid_zeros_and_empty_values_are_rejected(world: World, request_name:
     assert world.http.call("rosAFE/getProcessors") == before
 
 
-def test_the_error_of_an_empty_value_has_a_reason(world: World) -> None:
-    start(world, "PreProc")
-    with pytest.raises(HttpError) as refused:
-        world.http.call("rosAFE/GammatoneProc", {"upperDepName": ""})
-    assert refused.value.ex == "::rosAFE::e_noUpperDependencie"
-    with pytest.raises(HttpError) as refused:
-        world.http.call("bass/Acquire", {"device": "scene:", "nFramesPerChunk": 0})
-    assert refused.value.ex == "::bass::e_hwparams"
-
-
 def test_zeros_of_plain_ros_clients_stand_for_defaults(world: World) -> None:
     start(world)
     done = world.graph.run("rosservice", "call", "/rosAFE/PreProc", "{name: plain, pp_coefPreEmphasis: 0}")
@@ -98,18 +88,6 @@ def test_the_values_of_get_parameters_create_an_equal_processor(world: World) ->
     assert first["fb_nERBs"] == 0
     world.http.call("rosAFE/GammatoneProc", {**first, "name": "second"})
     assert reported_parameters(world, "gammatone", "second") == {**first, "name": "second"}
-
-
-def test_zeros_of_tcl(world: World) -> None:
-    script = """
-        rosAFE::PreProc {name a pp_coefPreEmphasis 0}
-        set r [rosAFE::PreProc {name b pp_coefPreEmphasis 0} &]
-        while {[catch {rosAFE::getDependencies b}]} {}
-        dict for {- one} [dict get [rosAFE::getParameters] parameters preProc] {
-            show [dict get $one name] [dict get $one pp_coefPreEmphasis]
-        }
-    """
-    assert world.lines(INPUT + script) == ["a|0.0", "b|0.0"]
 
 
 # --- unknown words ----------------------------------------------------------------------------------------------
@@ -261,13 +239,3 @@ def _granted(world: World, name: str) -> bool:
         return "dau is used" in world.http.call(f"{name}/modifyParameter", change)["warning"]
     except HttpError:
         return False
-
-
-@pytest.mark.parametrize(
-    ("name", "meant"),
-    [("getparameters", "getParameters"), ("PitchPort", "pitchPort"), ("amsfeaturesport", "amsFeaturesPort")],
-)
-def test_a_choice_in_another_case_causes_a_warning(world: World, name: str, meant: str) -> None:
-    with pytest.raises(HttpError) as refused:
-        world.http.call(f"rosAFE/{name}")
-    assert refused.value.ex == "::genom::no_such_service" and refused.value.what.endswith(f"; did you mean {meant}?")

@@ -5,16 +5,12 @@ from __future__ import annotations
 import asyncio
 import socket
 import xmlrpc.client
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from rosafe.ros1.client.graph import Graph as RosGraph
 from rosafe.web.genomix import routes
-from tests import harness
 from tests.harness import Graph
-from tests.matlab import octave
 from tests.web.genomix.world import Http, port_of
 
 pytestmark = pytest.mark.ros
@@ -106,38 +102,3 @@ def test_an_invalid_name(graph: Graph, name: str) -> None:
 
 
 # --- clients ---
-
-NAMELESS = """
-import sys
-from rosafe.web.genomix import daemon
-daemon.own_names = lambda: set()
-sys.exit(daemon.main(["-v", "-p", "0", *sys.argv[1:]]))
-"""
-
-
-@pytest.fixture
-def nameless(graph: Graph) -> Iterator[int]:
-    """The port of a genomixd that does not have the name of this machine."""
-    code = f"import sys; sys.path.insert(0, {str(harness.ROOT)!r}){NAMELESS}"
-    with graph.start(harness.PYTHON, "-c", code) as server:
-        yield port_of(server)
-
-
-def test_clients_get_the_error_immediately(graph: Graph, nameless: int, tmp_path: Path) -> None:
-    name = socket.gethostname()
-    try:
-        socket.getaddrinfo(name, nameless)
-    except OSError:
-        pytest.skip(f"the name of this machine, {name}, has no address here")
-    script = tmp_path / "script.tcl"
-    script.write_text(f"package require genomix\nputs [catch {{genomix::connect {name}:{nameless}}} told]$told")
-    output = graph.run("tclsh", str(script)).stdout
-    assert output.startswith("1") and "--name" in output and name in output
-    shown = octave.values(
-        graph.run(
-            *octave.command(tmp_path, f"show('told', message(@() genomix.client('{name}:{nameless}')));"),
-            timeout=60,
-            LANG="C.UTF-8",
-        ).stdout
-    )["told"]
-    assert shown.startswith("genomix:connection ") and f"--name {name}" in shown

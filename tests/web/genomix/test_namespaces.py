@@ -10,11 +10,10 @@ from types import SimpleNamespace
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-import genomix
 import pytest
 import soundfile
 
-from rosafe import setups
+from rosafe.tree import setups
 from tests.harness import Graph, free_port, wait_for
 from tests.matlab import octave
 from tests.web.genomix import world as worlds
@@ -132,18 +131,6 @@ def test_tcl(robots: SimpleNamespace) -> None:
         show [dict get [bass::Audio] Audio sampleRate]
     """
     assert robots.robot2.lines(script) == ["8000"]
-
-
-def test_python(robots: SimpleNamespace) -> None:
-    g = genomix.connect(f"127.0.0.1:{robots.outside.port}")
-    first = g.load("rosAFE", "-i", "robot1/rosAFE")
-    second = g.load("rosAFE", "-i", "/robot2/rosAFE", "as", "second")
-    names = [[one["name"] for one in afe.getProcessors()["processors"]] for afe in (first, second)]
-    assert names == [["input", "of_robot1"], ["input", "of_robot2"]]
-    assert first.preProcPort("of_robot1")["preProcPort"]["sampleRate"] == 16000
-    assert g.load("robot2/bass").Audio()["Audio"]["sampleRate"] == 8000
-    with pytest.raises(genomix.GenoMError, match="rosAFE is not running"):
-        g.load("rosAFE")
 
 
 def test_octave(robots: SimpleNamespace, tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from rosafe import interface
 from rosafe.interface import ComponentError
 from rosafe.ros1.client import installed_components, tcpros
 from tests import harness
-from tests.matlab import octave
 from tests.web.genomix import world as worlds
 from tests.web.genomix.arm.package import generate
 from tests.web.genomix.world import Http, HttpError, World
@@ -226,32 +225,3 @@ def test_a_large_message_does_not_delay_other_requests(size: int) -> None:
 
     thread = asyncio.run(tcpros.decode(Message(), bytearray(size)))
     assert (thread is threading.current_thread()) == (size < tcpros.LARGE)
-
-
-def test_octave(robot: World) -> None:
-    shown = octave.run_and_parse(
-        robot,
-        """
-        client = genomix.client;
-        arm = client.load('arm');
-        arm.SetSpeed('FAST');
-        show('speed', arm.GetSpeed().result.speed);
-        pose = struct('position', struct('x', 1, 'y', 2), 'angles', {{0.5 0.25 0}}, 'frame', 'base');
-        r = arm.SetPose(pose, {struct('x', 1, 'y', 2)}, 1);
-        show('points', r.result.points);
-        show('x', r.result.pose.position.x);
-        state = arm.State();
-        show('state', {state.State.pose.frame, numel(state.State.path)});
-        moved = arm.Move('-a', struct('distance', 2, 'speed', 'SLOW'));
-        show('moved', {moved.wait(60), moved.result.moved});
-        show('failed', arm.SetSpeed('RAPID').exception.ex);
-        """,
-    )
-    assert shown == {
-        "speed": "::arm::FAST",
-        "points": 1,
-        "x": 1,
-        "state": ["base", 1],
-        "moved": ["done", 2],
-        "failed": "::genom::serialization",
-    }

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+import tomllib
 import yaml
 
 from tests import harness
@@ -25,96 +27,12 @@ class Refusal(NamedTuple):
     given: dict[str, Any]
     ex: str
     why: str
-    command: tuple[str, ...] = ()
+    command: Sequence[str] = ()
 
 
-TREE = "there are: input, preProc, gammatone, ihc"
-CHANGE = {"nameProc": "preProc", "nameParam": "pp_bRemoveDc", "newValue": "1"}
-VALUE = "e_badNewValue"
-# Each exception, and a value of each type; tests/interface and tests/tree check the rules of the parameters.
-REFUSALS = (
-    Refusal("rosAFE/getDependencies", {"nameProc": "ratemap"}, "e_noSuchProcessor", f"no processor 'ratemap'; {TREE}"),
-    Refusal("rosAFE/removeProcessor", {"name": "input"}, "e_noSuchProcessor", "the input, which cannot be removed"),
-    Refusal("rosAFE/PreProc", {"name": "preProc"}, "e_existsAlready", "'preProc' exists already, of kind preProc"),
-    Refusal(
-        "rosAFE/GammatoneProc",
-        {"name": "g", "upperDepName": "prePorc"},
-        "e_noUpperDependencie",
-        f"no processor 'prePorc'; {TREE}; of kind preProc: preProc",
-    ),
-    Refusal(
-        "rosAFE/IldProc",
-        {"name": "i", "upperDepName": "gammatone"},
-        "e_noUpperDependencie",
-        "'gammatone': expected a processor of kind ihc, got kind gammatone; of kind ihc: ihc",
-    ),
-    Refusal("rosAFE/PreProc", {"name": "two words"}, VALUE, "name: 'two words' also names a topic; use only letters"),
-    Refusal(
-        "rosAFE/GammatoneProc",
-        {"name": "g", "fb_cfHz": [500, -3]},
-        VALUE,
-        "fb_cfHz: expected a number above 0, at most 1000000, got -3",
-        ("request", "filterbank", "fb_cfHz=500,-3"),
-    ),
-    Refusal(
-        "rosAFE/RatemapProc",
-        {"name": "r", "rm_decaySec": -0.5},
-        VALUE,
-        "rm_decaySec: expected a number above 0, at most 3600, got -0.5",
-        ("request", "ratemap", "rm_decaySec=-0.5"),
-    ),
-    Refusal(
-        "rosAFE/GammatoneProc",
-        {"name": "g", "fb_lowFreqHz": 9000},
-        VALUE,
-        "fb_lowFreqHz: expected less than fb_highFreqHz (8000 Hz), got 9000 Hz",
-        ("request", "filterbank", "fb_lowFreqHz=9000"),
-    ),
-    Refusal(
-        "rosAFE/AutocorrelationProc",
-        {"name": "a", "ac_wname": "han"},
-        VALUE,
-        "; did you mean hann?",
-        ("request", "autocorrelation", "ac_wname=han"),
-    ),
-    Refusal("rosAFE/modifyParameter", CHANGE, "e_noSuchParameter", "; did you mean pp_bRemoveDC?"),
-    Refusal(
-        "rosAFE/modifyParameter",
-        {**CHANGE, "nameParam": "pp_bRemoveDC", "newValue": "on"},
-        VALUE,
-        "pp_bRemoveDC: expected a boolean: 0, 1, true or false, got 'on'",
-    ),
-    Refusal(
-        "rosAFE/connect_port",
-        {"local": "audio", "remote": "bass/Audio"},
-        "::genom::no_such_inport",
-        "no input port 'audio'; there are: Audio",
-    ),
-    Refusal(
-        "rosAFE/connect_port",
-        {"local": "Audio", "remote": "bas/Audio"},
-        "::genom::no_such_outport",
-        "/bas/Audio is not published",
-        ("request", "ild", "-i", "empty", "--connect", "bas/Audio"),
-    ),
-    Refusal(
-        "rosAFE/connect_port",
-        {"local": "Audio", "remote": "bass/genom_state"},
-        "::genom::port_io",
-        "/bass/genom_state: expected type binaudio_portStruct, got bass/genom_state_component",
-    ),
-    Refusal("rosAFE/abort_activity", {"activity": 4711}, "::genom::no_such_activity", "no activity 4711; there are: "),
-    Refusal(
-        "bass/Acquire",
-        {"device": "file:/no/such.wav"},
-        "e_device",
-        "/no/such.wav: No such file or directory",
-        ("record", "--device", "file:/no/such.wav"),
-    ),
-    Refusal(
-        "bass/Acquire", {"device": "hw:1,0'; rm"}, "e_device", "hw:1,0'; rm", ("record", "--device", "hw:1,0'; rm")
-    ),
-)
+REFUSALS = [
+    Refusal(**one) for one in tomllib.loads(Path(__file__).with_name("refusals.toml").read_text("utf-8"))["refusal"]
+]
 WITH_COMMAND = [refusal for refusal in REFUSALS if refusal.command]
 
 # Run `rosservice call NAME YAML` and `rosafe WORD ...` in one process, because starting Python is slow.

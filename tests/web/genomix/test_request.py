@@ -129,15 +129,6 @@ def test_a_failed_request_leaves_no_processor(sound: World) -> None:
     assert refusal(lambda: http.call("bass/request", ["ild"])).ex == "::genom::no_such_service"
 
 
-def test_in_the_background(sound: World) -> None:
-    number = sound.http.send("rosAFE/request", ["ild", {"fb_nChannels": 2}])
-    assert number.startswith("rosAFE::")
-    assert sound.http.wait(number, "done")["output"]["dependencies"] == CHAIN
-    number = sound.http.send("rosAFE/request", ["ild", {"fb_nChannels": 1000, "fb_lowFreqHz": 9000}])
-    assert sound.http.wait(number, "error")["exception"]["ex"] == "::rosAFE::e_badNewValue"
-    assert refusal(lambda: sound.http.send("rosAFE/request", ["ild", {"x": 1}])).ex == "::genom::serialization"
-
-
 def test_four_concurrent_clients(sound: World) -> None:
     """Two HTTP clients, one of them in a session, and two commands: one tree without duplicates."""
     channels = ["fb_nChannels=2", "fb_nChannels=2", "fb_nChannels=3", "fb_nChannels=3"]
@@ -268,12 +259,6 @@ def test_mistakes_on_the_command_line(world: World, arguments: list[str], code: 
     assert (got, out) == (code, "")
     assert message in err and err.count("\n") == 1 and err.startswith("rosafe request: ")
     assert names(world) == []
-
-
-def test_no_master(world: World) -> None:
-    uri = f"http://127.0.0.1:{harness.free_port()}"
-    done = world.graph.run("rosafe", "request", "ild", check=False, ROS_MASTER_URI=uri)
-    assert done.returncode == 1 and "start roscore first" in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_without_sound(world: World) -> None:

@@ -85,14 +85,6 @@ def test_functions_return_their_outputs(world: World) -> None:
     assert world.http.call("rosAFE/getParameters")["parameters"]["preProc"][0]["pp_bRemoveDC"] == 1
 
 
-def test_aliases_of_services_and_ports(world: World) -> None:
-    start_tree(world.http)
-    world.http.call("rosAFE/IhcProc")
-    world.http.call("rosAFE/Ratemap", {"name": "r"})
-    assert world.http.call("rosAFE/ratemapProcPort/r")["ratemapPort"]["numberOfChannels"] == 4
-    assert set(world.http.call("rosAFE/getSignal")["signals"]) == set(interface.CORE_REPRESENTATIONS)
-
-
 def test_signals_are_those_of_the_ports(world: World) -> None:
     """getSignals returns exactly the numbers that the port has published."""
     start_tree(world.http)
@@ -227,20 +219,6 @@ def live_activities(world: World, component: str) -> list[str]:
     return [activity["name"] for task in tasks for activity in task["activity"]]
 
 
-def test_the_activity_of_a_cleaned_request_continues(world: World) -> None:
-    number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
-    world.http.get("/request/clean", id=number, s="t")
-    harness.wait_for(lambda: live_activities(world, "bass") == ["Acquire"])
-
-
-def test_an_activity_that_fails(world: World) -> None:
-    number = world.http.send("bass/Acquire", {"device": "file:/no/such/file.wav"})
-    assert world.http.wait(number, "error")["exception"]["ex"] == "::bass::e_device"
-    with pytest.raises(HttpError) as caught:
-        world.http.get("/request/result", id=number, s="t")
-    assert caught.value.ex == "::bass::e_device"
-
-
 def test_requests_without_pauses_are_sent_in_order(world: World) -> None:
     """Each processor of the chain is requested before its parent has answered."""
     world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
@@ -344,13 +322,12 @@ def test_a_missing_element_is_not_logged_by_the_node(world: World) -> None:
         for element in ("dummyName", "filterbank_0", "FILTERBANK_0", "a/b"):
             with pytest.raises(HttpError, match="has no element"):
                 world.http.call(f"quiet/gammatonePort/{element}")
-        script = """
+        assert world.lines("""
             set g [genomix::connect $address]
             $g load rosAFE -i quiet
             set request [::quiet::preProcPort dummyName &]
             show [$request wait]
-        """
-        assert world.lines(script) == ["error"]
+        """) == ["error"]
         assert node.complaints == ""
 
 

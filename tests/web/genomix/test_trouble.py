@@ -150,7 +150,7 @@ def go_on(world: World) -> None:
     assert (caught.value.ex, caught.value.what) == ("::genom::no_such_outport", "ihcPort has no element 'none'")
     http.call("rosAFE/removeProcessor", ["ihc"])
     assert http.wait(number, "done", s="new")["output"] == {}
-    script = """
+    assert world.lines("""
         set g [genomix::connect $address]
         $g load rosAFE
         $g load bass
@@ -161,8 +161,7 @@ def go_on(world: World) -> None:
         show [dict get [rosAFE::gammatonePort gammatone] gammatonePort numberOfChannels] [$acquire status]
         bass::Stop
         show [$acquire wait]
-    """
-    assert world.lines(script) == ["gammatone", "4|sent", "done"]
+    """) == ["gammatone", "4|sent", "done"]
     with pytest.raises(HttpError, match="no ROS master at"):
         http.get("/load/stranger")
 
@@ -191,23 +190,6 @@ def test_a_component_that_moves_is_found_again(empty_world: World) -> None:
         with world.graph.node("bass-ros"):
             assert world.http.call("bass/Stop") == {}
             assert world.http.call("bass/Audio")["Audio"]["left"] == []
-
-
-def test_a_master_that_has_not_started_yet(tmp_path: Path) -> None:
-    master = harness.MasterProcess()
-    graph = harness.Graph(master.uri, tmp_path)
-    with worlds.genomixd(graph) as (server, port):
-        world = World(graph, master, server, port)
-        assert f"no ROS master at {master.uri}" in problem(world, "bass/Stop")
-        master.start(graph.env)
-        try:
-            with graph.node("bass-ros"):
-                assert world.http.call("bass/Stop") == {}
-                number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
-                world.http.call("bass/Stop")
-                world.http.wait(number, "done")
-        finally:
-            master.kill()
 
 
 # bass-ros that opens a source only when the file argv[1] exists, unless it is stopped before.

@@ -116,7 +116,7 @@ class World:
     def tcl(
         self, script: str, timeout: float = 120.0, check: bool = True, shell: str = "tclsh"
     ) -> subprocess.CompletedProcess[str]:
-        """Run a script in a Tcl shell; ``$address`` is that of genomixd, and ``show`` prints a value on a line."""
+        """Run a script in a Tcl shell; ``$address`` is that of genomixd; the prelude has further commands."""
         prelude = f"""
             package require genomix
             set address 127.0.0.1:{self.port}
@@ -124,6 +124,19 @@ class World:
             proc failure {{script}} {{
                 if {{![catch {{uplevel 1 $script}} message options]}} {{error "no error: $script"}}
                 return [list $message [dict get $options -errorcode]]
+            }}
+            proc load_both {{}} {{uplevel #0 {{
+                set g [genomix::connect $address]
+                $g load bass
+                $g load rosAFE
+                rosAFE::connect_port Audio bass/Audio
+            }}}}
+            proc start_tree {{}} {{
+                load_both
+                bass::Acquire scene:
+                rosAFE::InputProc
+                rosAFE::PreProc
+                rosAFE::GammatoneProc {{fb_nChannels 4}}
             }}
         """
         path = self.graph.home / "script.tcl"

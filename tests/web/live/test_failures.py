@@ -12,7 +12,7 @@ import pytest
 
 from tests import harness
 from tests.harness import Graph, wait_for
-from tests.web.live.world import Live, Page, page
+from tests.web.live.world import Live, Page, page, script
 
 pytestmark = pytest.mark.ros
 
@@ -126,17 +126,20 @@ def test_an_exception_while_answering_closes_the_connection_with_its_reason(worl
 @pytest.mark.parametrize(
     ("data", "code", "reason"),
     [
-        ("nonsense", 1003, "expected a request with id and do"),
+        *(
+            (text, 1003, "expected a request with id and do")
+            for text in ("nonsense", "[]", '{"id": 1}', '{"id": "x", "do": "look"}', "[" * 50_000)
+        ),
         (b"bytes", 1003, "expected a request as text, got bytes"),
         (None, 1007, "expected a text in UTF-8"),
     ],
-    ids=["text", "bytes", "encoding"],
+    ids=["text", "list", "half", "number", "deep", "bytes", "encoding"],
 )
 def test_a_malformed_request_closes_the_connection_with_a_reason(
     world: World, data: str | bytes | None, code: int, reason: str
 ) -> None:
     async def scenario() -> tuple[int | None, Any]:
-        async with page(world.live) as client:
+        async with page(world.live) as client, page(world.live) as other:
             if isinstance(data, str):
                 await client.socket.send_str(data)
             elif data is not None:
@@ -145,32 +148,14 @@ def test_a_malformed_request_closes_the_connection_with_a_reason(
                 writer: Any = client.socket._writer
                 send = getattr(writer, "send_frame", None) or writer._send_frame  # Debian 12's version has the second
                 await send(b"\xff", aiohttp.WSMsgType.TEXT)
-            return await closing_frame(client)
+            closed = await closing_frame(client)
+            assert "unknown request" in (await other.request("explode"))["error"]
+            return closed
 
     assert asyncio.run(scenario()) == (code, reason)
 
 
-# The result of link.js for a message with one column of the given number.
-READ = """
-const [low, high] = arguments;
-class Socket extends EventTarget { constructor() { super(); Socket.one = this; } }
-const real = window.WebSocket;
-window.WebSocket = Socket;
-return import("/link.js").then(({ Link }) => {
-  const link = new Link();
-  link.open();
-  window.WebSocket = real;
-  const buffer = new ArrayBuffer(56), bytes = new DataView(buffer);
-  bytes.setUint16(0, 2, true); bytes.setUint16(2, 1, true);
-  bytes.setUint32(8, 7, true); bytes.setUint16(12, 1, true); bytes.setUint16(14, 1, true);
-  bytes.setUint32(16, low, true); bytes.setUint32(20, high, true); bytes.setFloat64(24, 12.5, true);
-  bytes.setUint8(40, 1); bytes.setUint8(41, 3); bytes.setFloat32(48, 0.25, true);
-  let got = null;
-  link.addEventListener("columns", ({ detail }) => { got = { ...detail, values: [...detail.values], first: String(detail.first) }; });
-  Socket.one.dispatchEvent(new MessageEvent("message", { data: buffer }));
-  return got;
-});
-"""  # noqa: E501  # JavaScript
+READ = script("decoded_columns")
 
 
 def test_the_page_decodes_large_column_numbers_and_shows_why_it_was_closed(world: World) -> None:

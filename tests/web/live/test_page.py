@@ -17,69 +17,14 @@ pytest.importorskip("selenium", reason="python3-selenium is not installed: scrip
 from rosafe.audio.devices.scene import Scene
 from tests.harness import Graph, Process, wait_for
 from tests.web.live.browser import Browser, browser
-from tests.web.live.world import Live, build, live, localizer
+from tests.web.live.world import Live, build, live, localizer, script
 
 SCENE = Scene(16000, seconds=5.0)
-# The circle of the directions while the true azimuth is in front: the azimuths of the page, and the mean positions of
-# the pixels with the colours of source 7 and of the truth near the rim, in units of the radius, right and downwards.
-CIRCLE = """
-const canvas = document.querySelector('canvas[data-kind=directions]');
-if (!canvas?.dataset.plot) return null;
-const { circle: { x, y, r }, present, truth } = JSON.parse(canvas.dataset.plot);
-if (present.length !== 1 || truth.length !== 1 || Math.abs(truth[0]) > 60) return null;
-const size = Math.round(2.2 * r);
-const [x0, y0] = [Math.round(x - size / 2), Math.round(y - size / 2)];
-const { data } = canvas.getContext("2d").getImageData(x0, y0, size, size);
-const centre = (colour) => {
-  let [sx, sy, count] = [0, 0, 0];
-  for (let at = 0; at < size * size; at += 1) {
-    const [dx, dy] = [(at % size) + 0.5 + x0 - x, Math.floor(at / size) + 0.5 + y0 - y];
-    const distance = Math.hypot(dx, dy) / r;
-    const far = [0, 1, 2].reduce((sum, one) => sum + Math.abs(data[4 * at + one] - colour[one]), 0);
-    if (distance > 0.78 && distance < 0.97 && far < 30) { sx += dx; sy += dy; count += 1; }
-  }
-  return count > 10 ? [sx / count / r, sy / count / r] : null;
-};
-const result = { present, truth, sourcePlace: centre([255, 180, 84]), truthPlace: centre([255, 255, 255]) };
-return result.sourcePlace && result.truthPlace ? result : null;
-"""
+CIRCLE = script("circle")
 READ = "document.querySelector('canvas[data-kind=directions]').closest('.panel').querySelector('.read').textContent"
 
-# For each column of a plot: the row of the pixel nearest to a colour, and its distance; and the position of the plot.
-TRACK = """
-const canvas = document.querySelector(`canvas[data-kind="${arguments[0]}"]`);
-if (!canvas?.dataset.plot) return null;
-const plot = JSON.parse(canvas.dataset.plot);
-const [x0, y0, w, h] = [plot.x, plot.y, plot.w, plot.h].map(Math.round);
-const { data } = canvas.getContext("2d").getImageData(x0, y0, w, h);
-const colour = arguments[1];
-const rows = [], far = [];
-for (let x = 0; x < w; x += 1) {
-  let best = Infinity, row = -1, count = 0;
-  for (let y = 0; y < h; y += 1) {
-    const at = 4 * (y * w + x);
-    const d = Math.abs(data[at] - colour[0]) + Math.abs(data[at + 1] - colour[1]) + Math.abs(data[at + 2] - colour[2]);
-    if (d < best) { best = d; row = y; count = 1; } else if (d === best) { row += y; count += 1; }
-  }
-  rows.push(row / count); far.push(best);
-}
-return { plot, rows, far };
-"""
-# The mean colour of the upper third of a plot, for each column.
-TINT = """
-const canvas = document.querySelector(`canvas[data-kind="${arguments[0]}"]`);
-if (!canvas?.dataset.plot) return null;
-const plot = JSON.parse(canvas.dataset.plot);
-const [x0, y0, w, h] = [plot.x, plot.y, plot.w, plot.h / 3].map(Math.round);
-const { data } = canvas.getContext("2d").getImageData(x0, y0, w, h);
-const tints = [];
-for (let x = 0; x < w; x += 1) {
-  let sum = 0;
-  for (let y = 0; y < h; y += 1) sum += data[4 * (y * w + x)] - data[4 * (y * w + x) + 2];
-  tints.push(sum / h);
-}
-return { plot, tints };
-"""
+TRACK = script("track")
+TINT = script("tint")
 
 
 END = "JSON.parse(document.querySelector('canvas[data-kind=ild]').dataset.plot).to"

@@ -1,4 +1,4 @@
-"""The reduction of the frames of a port to the columns of a plot, and their encoding as bytes."""
+"""The reduction of the frames of a port to the columns of a plot, and their encoding as bytes; losses."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from rosafe.ros1.client.port_reader import Frames
 from rosafe.ros1.client.tree_snapshot import ProcessorInfo, TreeSnapshot
 from rosafe.web.live import image_topics
 from rosafe.web.live.client import BrowserConnection
+from rosafe.web.live.health import Health
 from rosafe.web.live.plot_data import PlotLayout, quantize
 from rosafe.web.live.subscriptions import parse_keys
 from rosafe.web.live.views import FLOAT, PIECE, QUANTISED, Hub, Key, View, _Columns
@@ -308,3 +309,12 @@ def test_images_have_high_frequencies_on_top_and_missing_values_are_black() -> N
     bright = [[bool(image[row, column].min() > 150) for column in range(2)] for row in (0, -1)]
     assert bright == [[False, True], [True, False]]
     assert image[-1, 1].tolist() == [0, 0, 0]
+
+
+def test_losses_are_those_since_the_previous_message() -> None:
+    health: Any = Health("/rosAFE", "/bass", "/localizer")
+    health._subscriber = object()
+    for lost in ("3", "5", "5", "1"):  # the last one after a restart
+        entry = SimpleNamespace(key="lost", value=lost)
+        health._receive(SimpleNamespace(status=[SimpleNamespace(name="rosAFE: audio", values=[entry])]))
+    assert [one["what"] for one in health.status()["losses"]] == ["2 audio frames were lost between bass and rosAFE"]

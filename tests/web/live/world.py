@@ -9,6 +9,7 @@ import struct
 from collections import deque
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -19,6 +20,11 @@ from tests.harness import PATIENCE, Graph, Process, wait_for
 PIECE = struct.Struct("<IHHQdffBB6x")  # as described in docs/live.md
 TREE = ("ratemap", "ild", "itd", "ic")
 GRID = np.radians(np.arange(-175, 181, 5))  # of a posterior
+
+
+def script(name: str) -> str:
+    """Return a script for the browser, of the folder `scripts`."""
+    return (Path(__file__).with_name("scripts") / f"{name}.js").read_text("utf-8")
 
 
 class Live:

@@ -6,8 +6,7 @@ import socket
 
 import pytest
 
-from rosafe.web.server.access import check_host, host_name, own_names
-from rosafe.web.server.refusal import HttpRefusal
+from rosafe.web.server.access import HttpRefusal, check_host, host_name, own_names
 
 
 @pytest.mark.parametrize(

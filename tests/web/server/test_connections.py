@@ -15,9 +15,9 @@ import pytest
 from aiohttp import web
 
 from rosafe.web.server import connections
+from rosafe.web.server.access import HttpRefusal
 from rosafe.web.server.connections import ClientAccount, Connections, HttpConnection, Limits, _address
 from rosafe.web.server.listener import HttpListener, connection_of
-from rosafe.web.server.refusal import HttpRefusal
 from tests.harness import PATIENCE
 
 LIMITS = Limits(

@@ -10,7 +10,8 @@ const BACKGROUND = "#0a0c18"; // similar to the darkest colour of the map "deep"
 const COLOURS = ["#ffb454", "#7ee787", "#79c0ff", "#ff7b9c", "#d2a8ff", "#f2e05c"]; // of the sources, by their numbers
 const TRUTH = "#ffffff";
 const PRESENT = 0.5; // probability of a source that is present
-const SOURCE_NUMBERS = 4; // number, azimuth, standard deviation, probability
+const SPEAKS = 0.5; // probability of a source that speaks
+const SOURCE_NUMBERS = 5; // number, azimuth, standard deviation, probabilities that it exists and that it speaks
 const STALE_SECONDS = 1; // without a column until the circle is empty
 const LOW = -177.5; // degrees at the lower edge of the plot over time
 const MARKS = [180, 90, 0, -90]; // degrees
@@ -32,7 +33,7 @@ export class DirectionPanel {
     const close = el("button", { class: "quiet", title: "Close this plot", "aria-label": "close", text: "✕", onclick: () => plots.close(this) });
     this.element = el(
       "article", { class: "panel" },
-      el("div", { class: "head" }, this.heading, el("span", { class: "subtitle", text: "localizer · white: truth of a scene" }), this.readout, close), this.canvas,
+      el("div", { class: "head" }, this.heading, el("span", { class: "subtitle", text: "localizer · filled: speaks · white: truth of a scene" }), this.readout, close), this.canvas,
     );
     const point = (event) => {
       const box = this.canvas.getBoundingClientRect();
@@ -73,8 +74,8 @@ export class DirectionPanel {
     const { azimuths, slots } = this.view;
     const sources = [];
     for (let slot = 0; slot < slots; slot += 1) {
-      const [id, azimuth, std, probability] = column.subarray(azimuths.length + slot * SOURCE_NUMBERS, azimuths.length + (slot + 1) * SOURCE_NUMBERS);
-      if (Number.isFinite(azimuth)) sources.push({ id, azimuth, std, probability });
+      const [id, azimuth, std, probability, speech] = column.subarray(azimuths.length + slot * SOURCE_NUMBERS, azimuths.length + (slot + 1) * SOURCE_NUMBERS);
+      if (Number.isFinite(azimuth)) sources.push({ id, azimuth, std, probability, speaks: speech > SPEAKS });
     }
     return sources;
   }
@@ -169,14 +170,16 @@ export class DirectionPanel {
       context.arc(...at(azimuth, 0.9 * r), 7, 0, 2 * Math.PI);
       context.stroke();
     }
-    for (const { id, azimuth, std, probability } of this.#sources(column)) {
+    for (const { id, azimuth, std, probability, speaks } of this.#sources(column)) {
       context.globalAlpha = probability > PRESENT ? 1 : probability;
       context.strokeStyle = context.fillStyle = colourOf(id);
       context.lineWidth = 2;
       this.#line(context, at(azimuth, 0.12 * r), at(azimuth, 0.9 * r));
       context.beginPath();
       context.arc(...at(azimuth, 0.9 * r), 4, 0, 2 * Math.PI);
+      if (!speaks) context.fillStyle = BACKGROUND;
       context.fill();
+      context.stroke();
       context.lineWidth = 4;
       context.beginPath();
       const [first, last] = [azimuth + std, azimuth - std].map((a) => (-(a + 90) * Math.PI) / 180);
@@ -236,10 +239,11 @@ export class DirectionPanel {
       const x = box.x + (series.zero + index / series.rate - head + span) * perSecond;
       context.fillStyle = TRUTH;
       for (const azimuth of this.#truths(column)) context.fillRect(x, this.#height(azimuth, box) - 1, width, 2);
-      for (const { id, azimuth, probability } of this.#sources(column)) {
+      for (const { id, azimuth, probability, speaks } of this.#sources(column)) {
         if (probability <= PRESENT) continue;
         context.fillStyle = colourOf(id);
-        context.fillRect(x, this.#height(azimuth, box) - 2, width, 4);
+        context.fillRect(x, this.#height(azimuth, box) - 2, width, speaks ? 4 : 1);
+        if (!speaks) context.fillRect(x, this.#height(azimuth, box) + 1, width, 1);
       }
     });
     context.restore();
@@ -270,8 +274,8 @@ export class DirectionPanel {
   }
 }
 
-function sourceText({ id, azimuth, std, probability }) {
-  return `source ${id}: ${azimuthText(azimuth)} ± ${Math.round(std)}° (${probability.toFixed(2)})`;
+function sourceText({ id, azimuth, std, probability, speaks }) {
+  return `source ${id}: ${azimuthText(azimuth)} ± ${Math.round(std)}° (${probability.toFixed(2)})${speaks ? ", speaks" : ""}`;
 }
 
 function colourOf(id) {

@@ -1,1 +1,0 @@
-"""Recording: sound from any source into WAV files and bags, with its levels."""

@@ -1,0 +1,89 @@
+"""The device `topic:`: sound of another driver, in `audio_common_msgs`."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from rosafe.audio.devices import SoundSource, open_source
+from rosafe.audio.devices.base import device_error
+from rosafe.audio.devices.received import ReceivedSource
+
+PREFIX = "topic:"
+INFO = "audio_info"  # the topic beside that of the sound that describes its format
+QUEUE = 1000  # messages
+NOT_NUMBERED = 2**64 - 1
+
+
+class TopicSource(ReceivedSource):
+    """Two channels of the sound on a topic: see `ReceivedSource`."""
+
+    def __init__(self, node: Node, text: str, sample_rate: int, chunk: int, stopping: threading.Event) -> None:
+        super().__init__(text, sample_rate, chunk, stopping)
+        try:
+            from audio_common_msgs.msg import AudioData, AudioDataStamped, AudioInfo
+        except ImportError:
+            raise device_error(
+                f"{self.name}: expected the package audio_common_msgs, got none; "
+                "run apt install ros-$ROS_DISTRO-audio-common-msgs"
+            ) from None
+        self._node = node
+        group = ReentrantCallbackGroup()  # messages arrive while a service waits for them
+        publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(self.topic))
+        stamped = any(one.topic_type.endswith("/AudioDataStamped") for one in publishers)
+        reliable = all(one.qos_profile.reliability == ReliabilityPolicy.RELIABLE for one in publishers)
+        policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        qos = QoSProfile(depth=QUEUE, reliability=policy)
+        namespace = self.topic.rpartition("/")[0]
+        self._subscriptions = [
+            node.create_subscription(
+                AudioDataStamped if stamped else AudioData,
+                self.topic,
+                self._receive_stamped if stamped else self._receive_plain,
+                qos,
+                callback_group=group,
+            )
+        ]
+        if self.needs_description:
+            info = f"{namespace}/{INFO}" if namespace or self.topic.startswith("/") else INFO
+            self._subscriptions.append(
+                node.create_subscription(AudioInfo, info, self._describe, QoSProfile(depth=1), callback_group=group)
+            )
+        try:
+            self.begin("" if publishers else "the topic has no publisher")
+        except BaseException:
+            self.close()
+            raise
+
+    def _describe(self, info: Any) -> None:
+        self.describe(info.channels, info.sample_rate, info.sample_format, info.coding_format)
+
+    def _receive_plain(self, message: Any, info: Any) -> None:
+        self.receive(message.data, 0, _number(info))
+
+    def _receive_stamped(self, message: Any, info: Any) -> None:
+        stamp = message.header.stamp
+        self.receive(message.audio.data, stamp.sec * 1_000_000_000 + stamp.nanosec, _number(info))
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._subscriptions = []
+
+
+def _number(info: Any) -> int | None:
+    """Return the number that the publisher has given to a message, if the middleware has it."""
+    number = int(info.get("publication_sequence_number", NOT_NUMBERED))
+    return None if number == NOT_NUMBERED else number
+
+
+def open_device(node: Node, device: str, rate: int, chunk: int, stopping: threading.Event) -> SoundSource:
+    """Open a device: see `rosafe.audio.devices.open_source`."""
+    if device.startswith(PREFIX):
+        return TopicSource(node, device.removeprefix(PREFIX), rate, chunk, stopping)
+    return open_source(device, rate, chunk, stopping)

@@ -1,0 +1,127 @@
+"""Streams while sound arrives: those of the library, at the right times and numbers, only while they are used."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.head import Head
+from rosafe.localization.live_streams import LiveStreams, SoundBlock
+from rosafe.localization.streams import SourcePart
+from tests.harness import wait_for
+from tests.localization.conftest import RATE, modulated
+from tests.localization.test_streams import track
+
+CLOCK = 1000.0  # s, of the first sample
+
+
+class Sound:
+    """Blocks of 20 ms, of which some are lost."""
+
+    def __init__(self, ears: np.ndarray, lost: range = range(0)) -> None:
+        samples = np.round(ears * 2**31).astype(np.int32)
+        blocks = [
+            SoundBlock(samples[:, n : n + 320], n, CLOCK + n / RATE) for n in range(0, samples.shape[1] - 319, 320)
+        ]
+        self._blocks = iter([block for number, block in enumerate(blocks) if number not in lost])
+        self.closed = threading.Event()
+        self.at_end = False
+
+    def read(self, seconds: float) -> SoundBlock | None:
+        block = next(self._blocks, None)
+        if block is None:
+            self.at_end = True
+            time.sleep(0.01)
+        return block
+
+    def close(self) -> None:
+        self.closed.set()
+
+
+class Status:
+    """Keeps the last state."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *values, **_: self.lines.append(" ".join(map(str, (name, *values))))
+
+
+class Session:
+    """Streams with subscribers, as the test says."""
+
+    def __init__(self) -> None:
+        self.parts: list[tuple[SourcePart, float]] = []
+        self.status = Status()
+        self.wanted = True
+        self.streams = LiveStreams(
+            lambda part, moment: self.parts.append((part, moment)), lambda: self.wanted, lambda: False, self.status
+        )
+
+
+@pytest.fixture
+def session() -> Iterator[Session]:
+    found = Session()
+    yield found
+    found.streams.close()
+
+
+@pytest.fixture(scope="module")
+def ears() -> np.ndarray:
+    return Head.sphere().render(modulated(3.0, 5), RATE, 40.0)
+
+
+def last_time(session: Session) -> float:
+    return session.parts[-1][1] if session.parts else 0.0
+
+
+def test_times_numbers_and_ids(session: Session, sphere_model: Path, ears: np.ndarray) -> None:
+    sound = Sound(ears, lost=range(60, 63))
+    session.streams.connect(DirectionModel.load(sphere_model), lambda: sound)
+    session.streams.begin_again(10)
+    session.streams.update(CLOCK - 1.0, [track(1, 40.0)], 0.0)
+    session.streams.start()
+    wait_for(lambda: len(session.parts) > 55, what=lambda: f"parts before the loss: {session.status.lines}")
+    wait_for(lambda: sound.at_end, what="the end of the sound")
+    assert {part.id for part, _ in session.parts} == {11}
+    first = [(part, moment) for part, moment in session.parts[:50]]
+    assert first[0][0].first_sample == 0
+    for (before, _), (after, _) in itertools.pairwise(first):
+        assert after.first_sample == before.first_sample + len(before.samples)
+    heard = np.concatenate([part.samples for part, _ in first])[RATE // 10 :] / 2**15
+    begin = round((first[0][1] - CLOCK) * RATE) + RATE // 10
+    truth = ears[0, begin : begin + len(heard)]
+    assert np.sum((heard - truth) ** 2) < 0.05 * np.sum(truth**2), "the stamp of a part is that of its first sample"
+    assert all(moment - CLOCK < 1.2 for _, moment in session.parts), "after the loss the streams begin again"
+    assert not np.isfinite(session.streams.speech(11)) or session.streams.speech(11) <= 1
+
+
+def test_sound_is_read_for_subscribers_only(session: Session, sphere_model: Path, ears: np.ndarray) -> None:
+    opened: list[Sound] = []
+
+    def open_sound() -> Sound:
+        opened.append(Sound(ears))
+        return opened[-1]
+
+    session.wanted = False
+    session.streams.connect(DirectionModel.load(sphere_model), open_sound)
+    session.streams.start()
+    session.streams.update(CLOCK, [track(1, 40.0)], 0.0)
+    session.wanted = True
+    wait_for(lambda: session.parts, what=lambda: f"parts: {session.status.lines}")
+    session.wanted = False
+    wait_for(opened[0].closed.is_set, what="the end of the subscription")
+    assert len(opened) == 1
+    session.wanted = True
+    wait_for(lambda: len(opened) == 2, what="another subscription")
+    session.streams.connect(None)
+    wait_for(opened[1].closed.is_set, what="the end of the sound")

@@ -1,0 +1,69 @@
+"""Statistical reverberation: reverberation time, direct-to-reverberant ratio, coherence of the ears, determinism."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from rosafe.localization.head import Head
+from rosafe.localization.localize import localize
+from rosafe.localization.rooms import reverberant_filters
+from tests.localization.conftest import modulated
+
+RATE = 16000
+HEAD = Head.sphere()
+
+
+def late(azimuth: float, rt60: float, drr_db: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    response = reverberant_filters(HEAD, azimuth, RATE, rt60, drr_db, np.random.default_rng(seed))
+    direct = HEAD.filters(RATE).response(azimuth)
+    rest = response.copy()
+    rest[:, : direct.shape[1]] -= direct
+    return direct, rest
+
+
+@pytest.mark.parametrize(("azimuth", "rt60", "drr_db"), [(0, 0.2, 6), (75, 0.5, 0), (-140, 0.9, -5)])
+def test_energy_of_direct_sound_over_the_rest_and_its_decay(azimuth: float, rt60: float, drr_db: float) -> None:
+    for seed in range(3):
+        direct, rest = late(azimuth, rt60, drr_db, seed)
+        assert 10 * np.log10(np.sum(direct**2) / np.sum(rest**2)) == pytest.approx(drr_db, abs=1e-6)
+        decay = 10 * np.log10(np.cumsum(np.sum(rest**2, axis=0)[::-1])[::-1] / np.sum(rest**2))
+        first, last = (int(np.argmax(decay < level)) for level in (-5, -30))
+        assert 60 / 25 * (last - first) / RATE == pytest.approx(rt60, rel=0.15)
+
+
+def test_reflections_are_sparse_at_first_and_dense_later() -> None:
+    kurtosis = {}
+    for part, samples in {"early": slice(16, 240), "late": slice(3200, 4000)}.items():
+        rest = np.stack([late(30, 0.6, 0, seed)[1][0, samples] for seed in range(20)])
+        kurtosis[part] = np.mean(rest**4) / np.mean(rest**2) ** 2
+    assert kurtosis["early"] > 6
+    assert kurtosis["late"] < 5
+
+
+def test_late_part_is_diffuse() -> None:
+    rest = late(60, 0.9, -3, 1)[1]
+    frequency, coherence = scipy.signal.coherence(*rest[:, 800:10000], RATE, nperseg=256)
+    assert coherence[(frequency > 60) & (frequency < 200)].mean() > 0.6
+    assert coherence[frequency > 2000].mean() < 0.15
+
+
+def test_equal_generators_give_equal_rooms_and_others_do_not() -> None:
+    first, again, other = (
+        reverberant_filters(HEAD, 10, RATE, 0.3, 2, np.random.default_rng(seed)) for seed in (5, 5, 6)
+    )
+    assert np.array_equal(first, again)
+    assert not np.allclose(first, other, atol=1e-3)
+
+
+def test_directions_in_rooms(kemar: Head, kemar_model: Path) -> None:
+    """At 0 dB, in rooms that training has not seen; without reverberation among the conditions half are right."""
+    right = []
+    for number, azimuth in enumerate(range(-165, 180, 30)):
+        room = np.random.default_rng(100 + number)
+        response = reverberant_filters(kemar, azimuth, RATE, room.uniform(0.2, 0.8), 0.0, room)
+        sound = scipy.signal.oaconvolve(modulated(1.5, number)[np.newaxis], response, axes=-1)[:, : 3 * RATE // 2]
+        found = localize(sound, RATE, kemar_model, 1.0)
+        right.append(abs(found["azimuth"][-1] - azimuth) <= 5)
+    assert np.mean(right) >= 0.7

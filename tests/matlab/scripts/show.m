@@ -1,0 +1,3 @@
+function show(name, value)
+  printf('%s=%s\n', name, jsonencode(value));
+end

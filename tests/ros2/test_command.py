@@ -1,0 +1,103 @@
+"""`rosafe ros2` and `rosafe doctor`: what is missing, the process that they become, and its modules."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.commands.command import rosafe
+from tests.harness import SCRIPTS, Process, wait_for
+
+from .network import Network
+
+# Python imports it at its start, and it lists the modules at the end of the process.
+LIST_MODULES = """
+import atexit, json, os, sys
+if "rosafe.ros2.node" in sys.orig_argv:
+    files = lambda: {name: str(getattr(module, "__file__", "")) for name, module in list(sys.modules.items())}
+    atexit.register(lambda: open(os.environ["MODULES"], "w").write(json.dumps(files())))
+"""
+
+
+def test_what_is_missing_is_one_line(tmp_path: Path) -> None:
+    done = rosafe("ros2", "--ros-args", "-p", "device:=scene:")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("rosafe ros2: the Python package rclpy is not installed; ")
+    assert done.stderr.count("\n") == 1
+    (tmp_path / "rclpy.py").touch()
+    done = rosafe("ros2", PYTHONPATH=str(tmp_path))
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith(
+        "rosafe ros2: the Python package rosafe_msgs is not installed; build it with `colcon "
+    )
+    assert done.stderr.count("\n") == 1
+
+
+def test_help_and_wrong_arguments() -> None:
+    done = rosafe("ros2", "--help")
+    assert done.returncode == 0 and "rosafe ros2 --ros-args -p device:=scene:" in done.stdout
+    done = rosafe("ros2", "scene:")
+    assert done.returncode == 2 and "scene:" in done.stderr
+
+
+def test_doctor_reports_on_ros_2(ros2_env: dict[str, str]) -> None:
+    def check(env: dict[str, str]) -> dict[str, str]:
+        doctor = Process([str(SCRIPTS / "rosafe"), "doctor", "--json"], env, fork=False)
+        doctor.wait()
+        report = json.loads(doctor.out)
+        states = {one["name"]: one for one in report["checks"]}
+        assert all(one["state"] != "MISSING" for one in states.values()), states
+        return dict(states["ROS 2"])
+
+    path = {"PATH": "/usr/bin:/bin", "HOME": "/nonexistent"}
+    without = check(path)
+    assert (without["state"], without["detail"]) == ("note", "needed only by rosafe ros2: no rclpy in this shell")
+    found = check(ros2_env | path)
+    assert found["state"] == "ok" and "rmw_fastrtps_cpp" in found["detail"] and "rosafe_msgs" in found["detail"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_no_module_of_ros_1(ros2: Network, tmp_path: Path, number: int) -> None:
+    """The node is a process without any module of ROS 1, though the command and this machine have them."""
+    (tmp_path / "sitecustomize.py").write_text(LIST_MODULES)
+    modules = tmp_path / "modules.json"
+    path = os.pathsep.join((str(tmp_path), ros2.env["PYTHONPATH"]))
+    node = ros2.node("device:=scene:", "representations:=[ild]", PYTHONPATH=path, MODULES=str(modules))
+    wait_for(lambda: "acquiring" in node.err or not node.alive, what=lambda: node.err)
+    began = time.monotonic()
+    assert node.stop(number) == 0, node.err
+    assert time.monotonic() - began < 20  # 2 s on a machine without other work
+    assert "Traceback" not in node.err
+    found = json.loads(modules.read_text())
+    assert found["__main__"].endswith("/rosafe/ros2/node.py") and "rclpy" in found
+    for name in (
+        "rospy",
+        "rosgraph",
+        "genpy",
+        "genmsg",
+        "roslib",
+        "actionlib",
+        "rosAFE",
+        "bass",
+        "rosafe.ros1",
+        "rosafe.web",
+    ):
+        assert name not in found
+    venv = ros2.env["PATH"].split(":")[0].removesuffix("/bin")
+    for name in ("std_msgs", "geometry_msgs", "diagnostic_msgs", "tf2_msgs"):
+        assert Path(found[name]).is_relative_to(Path(venv).parent), found[name]
+
+
+@pytest.mark.parametrize(
+    ("parameter", "why"), [("devise:=scene", "did you mean device"), ("seconds:={", "Couldn't parse parameter")]
+)
+def test_wrong_parameters_are_one_line(ros2: Network, parameter: str, why: str) -> None:
+    node = ros2.node(parameter)
+    assert node.wait() == 1
+    lines = [line for line in node.err.splitlines() if "[rcl]" not in line]
+    assert len(lines) == 1 and lines[0].startswith("rosafe: ") and why in lines[0], node.err

@@ -1,0 +1,50 @@
+"""docs/ros2.md: its programs find the source of a scene, started as the page says; its tables have all names."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from rosafe.interface import ros2 as interface
+from tests.harness import ROOT, wait_for
+from tests.localization.conftest import sphere_model
+
+from .network import Network
+from .test_dds import AZIMUTH, scene
+
+__all__ = ["sphere_model"]
+
+PAGE = (ROOT / "docs" / "ros2.md").read_text("utf-8")
+PROGRAMS = re.findall("```python\n(.*?)```", PAGE, re.DOTALL)
+
+
+@pytest.mark.parametrize("number", [0, 2], ids=["rclpy", "cyclonedds"])
+def test_programs_that_print_sources(ros2: Network, tmp_path: Path, sphere_model: Path, number: int) -> None:
+    ros2.node(f"device:=scene:{scene(tmp_path)}", "localize:=true", f"head:={sphere_model}")
+    program = ros2.python(PROGRAMS[number])
+    wait_for(lambda: len(program.out.splitlines()) > 8, what=lambda: f"{program}: {program.out}{program.err}")
+    source, azimuth, level = map(int, program.out.splitlines()[-2].split())
+    assert (source, program.err) == (1, "")
+    assert abs(azimuth - AZIMUTH) < 8 and -60 < level < 0
+
+
+def test_the_program_that_prints_shapes(ros2: Network) -> None:
+    ros2.node("device:=scene:", "representations:=[ild, ratemap]")
+    program = ros2.python(PROGRAMS[1])
+    wait_for(lambda: len(program.out.splitlines()) > 3, what=lambda: f"{program}: {program.out}{program.err}")
+    assert re.fullmatch(r"\d+ \(31, \d\) 31 0", program.out.splitlines()[2]) and not program.err
+
+
+def test_every_topic_service_and_parameter_is_in_the_tables() -> None:
+    from_node = re.findall(r'"~/(\w+)"', "".join(p.read_text("utf-8") for p in (ROOT / "rosafe/ros2").glob("*.py")))
+    for name in [*from_node, "request", "add_processor", "remove_processor", "get_tree", "save_setup", "acquire"]:
+        assert f"`~/{name}`" in PAGE, name
+    node = (ROOT / "rosafe/ros2/node.py").read_text("utf-8")
+    declared = re.findall(r'^    "(\w+)": \(', node.partition("PARAMETERS")[2].partition("\n}")[0], re.MULTILINE)
+    assert len(declared) > 8
+    launch = (ROOT / "ros2/rosafe_ros2/launch/rosafe.launch.py").read_text("utf-8")
+    for name in declared:
+        assert f"`{name}`" in PAGE and f"'{name}': (" in launch, name
+    assert interface.MESSAGES.keys() >= {*re.findall(r"rosafe_msgs/msg/(\w+)", PAGE)}

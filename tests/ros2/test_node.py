@@ -1,0 +1,160 @@
+"""The node with a plain rclpy program: values, services, parameters, setups, start and end."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import soundfile
+
+import rosafe
+from rosafe.interface import KINDS
+from tests.harness import PATIENCE, wait_for
+
+from .client import Client, joined
+from .network import Network
+
+RATE = 16000
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six seconds of noise from different sides."""
+    path = tmp_path_factory.mktemp("sound") / "noise.wav"
+    noise = np.random.default_rng(1).normal(0, 0.05, (6 * RATE, 2))
+    soundfile.write(path, np.cumsum(noise, axis=0) * 0.02 + noise, RATE, subtype="PCM_16")
+    return path
+
+
+NODE = ["device", "frame_id", "frames_per_block", "head", "keep", "localize", "representations", "sample_rate", "setup"]
+NODE += ["start_type_description_service", "use_sim_time", "world_frame"]
+PARTS = {"precedence": "precedence_itd", "precedence/ild": "precedence_ild"}  # the results of `rosafe.process`
+
+
+@pytest.mark.filterwarnings("ignore:pi_rangeHz")
+def test_each_frame_once_with_the_values_of_process(ros2: Network, tmp_path: Path, sound: Path) -> None:
+    kinds = ["ild", "precedence", "itd", "onsetMap", "pitch", "preProc", "spectralFeatures", "amsFeatures"]
+    ros2.node(f"representations:=[{', '.join(kinds)}]", "frames_per_block:=441")
+    client = Client(ros2, tmp_path)
+    topics = [*kinds, "precedence/ild"]
+    for topic in topics:
+        client.subscribe(topic, reliable=topic != "ild")
+    assert client.call("acquire", device=f"file:{sound}") == {"success": True, "message": ""}
+    expected = rosafe.process(soundfile.read(sound, dtype="int32")[0].T, RATE, outputs=kinds)
+    assert len(client.call("get_tree")["processors"]) == 15
+    for topic in topics:
+        result = expected[PARTS.get(topic, topic)]
+        messages: list[Any] = client.take(topic)
+        while messages[-1]["first_frame"] + messages[-1]["shape"][-1] < result.shape[-1]:
+            messages += client.take(topic)  # the last chunk is padded
+        found, first = joined(messages), messages[0]["first_frame"]  # a subscription may be later than the first block
+        assert first < result.shape[-1] / 2
+        assert np.array_equal(found[..., : result.shape[-1] - first], result[..., first:], equal_nan=True)
+        kind = KINDS[topic.partition("/")[0]]
+        assert messages[0]["axes"] == list(kind.parts["/" in topic].axes) and messages[0]["kind"] == kind.kind
+        begin = messages[0]["header"]["stamp"]
+        assert abs(begin["sec"] - messages[0]["arrived"]) < 60
+        for axis in messages[0]["coordinates"]:
+            if axis["name"] == "channel":
+                assert axis["unit"] == "Hz" and np.array_equal(axis["values"], expected["fb_cfHz"])
+
+
+def test_errors_have_the_texts_of_ros_1(ros2: Network, tmp_path: Path) -> None:
+    ros2.node("device:=scene:", "representations:=[ild]")
+    client = Client(ros2, tmp_path)
+    client.subscribe("ild")
+    client.take("ild")
+    assert client.set(
+        ild__ild_wSizeSec=-1.0,
+        ild__ild_wname="hun",
+        ild__ild_hSizeSec="x",
+        gammatone__fb_nChannels=True,
+        ild__foo=1.0,
+        itd__cc_wSizeSec=1.0,
+        devise="scene:",
+    ) == [
+        "ild_wSizeSec: expected a number above 0, at most 60, got -1",
+        "ild_wname: expected one of hamming, hanning, hann, blackman, triang, sqrt_win, got 'hun'",
+        "ild_hSizeSec: expected a number, got 'x'",
+        "fb_nChannels: expected a whole number (unsigned long), got 'true'",
+        "processors of kind ild have no 'foo'; they have: ild_wname, ild_wSizeSec, ild_hSizeSec",
+        "there is no processor 'itd'; there are: input, preProc, gammatone, ihc, ild",
+        f"devise: expected one of {', '.join(NODE)}, or PROCESSOR.PARAMETER, got an unknown name; did you mean device?",
+    ]
+    assert client.get("ild.ild_wSizeSec") == 0.02
+    for service, fields, message in (
+        ("request", {"representation": "ild", "name": "sources"}, "name: expected another name than those of the"),
+        ("request", {"representation": "ild", "name": "a__b"}, "name: expected a letter, then letters, digits and"),
+        ("request", {"representation": "ild", "parameters": "ild_wSizeSec: -1"}, "line 1: parameters: ild_wSizeSec: "),
+        ("add_processor", {"kind": "itd"}, "there is no processor 'crosscorrelation'"),
+        ("add_processor", {"kind": "ild"}, "'ild' exists already"),
+        ("add_processor", {"kind": "ild", "name": "b", "parameters": "rm_wSizeSec: 1"}, "processors of kind ild have"),
+        ("remove_processor", {"name": "nobody"}, "there is no processor 'nobody'; there are: input, preProc"),
+        ("remove_processor", {"name": "input"}, "'input' is the input, which cannot be removed"),
+        ("acquire", {"device": "file:/missing.wav"}, "/missing.wav: No such file or directory"),
+        ("acquire", {"device": "scene:", "sample_rate": 48000}, "the tree runs at 44100 Hz, Audio is at 48000 Hz"),
+        ("load_setup", {"setup": "x: 1"}, "line 1: a setup: unknown 'x'"),
+    ):
+        answer = client.call(service, **fields)
+        assert not answer["success"] and answer["message"].startswith(message), answer
+    assert len(client.call("get_tree")["processors"]) == 5
+    client.take("ild", 5)
+
+
+def test_parameters_follow_the_processors(ros2: Network, tmp_path: Path) -> None:
+    ros2.node("device:=scene:", "representations:=[ild]", "ild.ild_wSizeSec:=0.03")
+    client = Client(ros2, tmp_path)
+    wait_for(lambda: client.get("ild.ild_wSizeSec") == 0.03)
+    assert client.set(ild__ild_wSizeSec=1, gammatone__fb_nChannels=8) == ["", ""]
+    assert client.get("ild.ild_wSizeSec") == 1.0
+    wait_for(lambda: len(client.get("gammatone.fb_cfHz")) == 8)
+    client.subscribe("ild")
+    wait_for(lambda: client.take("ild")[-1]["shape"][0] == 8)
+    assert client.call("request", representation="itd")["processors"][-1] == "itd"
+    assert client.get("crosscorrelation.cc_wSizeSec") == 0.02
+    assert client.call("remove_processor", name="crosscorrelation")["removed"] == ["itd", "crosscorrelation"]
+    assert client.get("crosscorrelation.cc_wSizeSec") is None
+    wait_for(lambda: "/rosafe/itd" not in client.ask("topics"))
+    assert client.call("stop")["success"] and client.get("ild.ild_wSizeSec") is None
+    assert client.call("get_tree")["processors"] == []
+
+
+def test_setups_are_saved_and_loaded_and_kept(ros2: Network, tmp_path: Path) -> None:
+    kept = tmp_path / "kept.yaml"
+    node = ros2.node("device:=scene:", "representations:=[ild]", f"keep:={kept}")
+    client = Client(ros2, tmp_path)
+    assert client.call("request", representation="ild", name="fine", parameters="ild_wSizeSec: 0.01")["success"]
+    setup = client.call("save_setup")["setup"]
+    tree = client.call("get_tree")
+    assert "device: 'scene:'" in setup and "  fine:\n    kind: ild\n" in setup
+    assert client.call("stop")["success"]
+    assert client.call("load_setup", setup=setup) == {"success": True, "message": ""}
+    assert client.call("get_tree") == tree
+    client.subscribe("fine")
+    client.take("fine")
+    began = time.monotonic()
+    assert node.stop(signal.SIGTERM) == 0
+    assert time.monotonic() - began < PATIENCE
+    ros2.node(f"keep:={kept}")
+    wait_for(lambda: client.call("get_tree") == tree)
+    client.take("fine")
+
+
+@pytest.mark.parametrize(
+    ("parameters", "line"),
+    [
+        (["devise:=scene:"], "rosafe: devise: expected a parameter of device,"),
+        (["frames_per_block:=x"], "rosafe: frames_per_block: expected a int, got 'x'"),
+        (["frames_per_block:=0"], "rosafe: nFramesPerBlock: expected a number from 1 to"),
+        (["device:=scene:", "representations:=[foo]"], "rosafe: representation: expected one of input, time,"),
+        (["setup:=/missing.yaml"], "rosafe: [Errno 2] No such file or directory: '/missing.yaml'"),
+        (["device:=scene:", "world_frame:=head"], "rosafe: world_frame: expected another frame than head_frame"),
+    ],
+)
+def test_unsuitable_parameters_end_the_start(ros2: Network, parameters: list[str], line: str) -> None:
+    node = ros2.node(*parameters)
+    assert node.wait() == 1 and node.err.startswith(line), node
