@@ -41,7 +41,7 @@ def page(program: str, summary: str) -> str:
     if program == "rosafe":
         text += ".SH COMMANDS\n"
         for module in pkgutil.iter_modules(commands.__path__):
-            if not module.name.startswith("_"):
+            if not module.ispkg and not module.name.startswith("_"):
                 text += f".SS rosafe {module.name}\n{preformatted(program, module.name)}"
     return f"{text}.SH SEE ALSO\nThe documents in /usr/share/doc/rosafe/docs\n"
 

@@ -217,9 +217,10 @@ class Sound:
 
     def _receive(self, new: Snapshot) -> None:
         """Give a chunk to the ring, with the clock time of the node."""
-        seconds = self.clock_time(new.time_ns / 1e9) if new.time_ns else 0.0
+        # The clock of a simulation is 0 before it begins, but the ring takes a stamp of 0 as unknown
+        seconds = max(1e-9, self.clock_time(new.time_ns / 1e9)) if new.time_ns else 0.0
         index = new.last_frame_index
-        stamp = {"sec": 0, "nsec": 1e9 * max(0.0, seconds)}
+        stamp = {"sec": 0, "nsec": 1e9 * seconds}
         window = _Window(new.sample_rate, 1, new.frames_per_chunk, index, new.left, new.right, stamp)
         if new.time_ns:
             known = self.ring.captured(index) if index > new.frames_per_chunk else None

@@ -17,10 +17,14 @@ from .network import Network
 
 # Python imports it at its start, and it lists the modules at the end of the process.
 LIST_MODULES = """
-import atexit, json, os, sys
+import json, os, sys
+def end(code, end=os._exit):
+    files = {name: str(getattr(module, "__file__", "")) for name, module in list(sys.modules.items())}
+    with open(os.environ["MODULES"], "w") as file:
+        json.dump(files, file)
+    end(code)
 if "rosafe.ros2.node" in sys.orig_argv:
-    files = lambda: {name: str(getattr(module, "__file__", "")) for name, module in list(sys.modules.items())}
-    atexit.register(lambda: open(os.environ["MODULES"], "w").write(json.dumps(files())))
+    os._exit = end
 """
 
 
