@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from . import buffer_pool, kernels
 from .erb import bandwidth
-from .numeric_limits import FLUSH_INTERVAL, FloatArray, clamp, flush_denormals
+from .numeric_limits import FLUSH_INTERVAL, FloatArray, clamp, flush_denormals, modulus
 
 POLES_PER_SECTION = 4
 TURN_SPAN = 64  # samples; SPAN of kernels/gammatone.c, whose `position` must be below it
@@ -95,7 +95,7 @@ def filter_by_scipy(
     """
     block = clamp(block)
     poles = -sections[..., 4]
-    lengths = np.abs(poles)
+    lengths = modulus(poles)
     turns = np.divide(poles, lengths, out=np.ones_like(poles), where=lengths > 0)
     state *= lengths * turns**position  # the state of direct form II transposed, p y[n]
     for first in range(0, block.shape[-1], FLUSH_INTERVAL):
@@ -107,7 +107,7 @@ def filter_by_scipy(
             state[:, channel] = after[..., 0].T
             output[:, channel, span] = analytic.real
             if envelope is not None:
-                np.abs(analytic, out=envelope[:, channel, span])
+                envelope[:, channel, span] = modulus(analytic)
         flush_denormals(state)
     back = lengths * turns ** ((position + block.shape[-1]) % TURN_SPAN)
     np.divide(state, back, out=state, where=lengths > 0)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import scipy
 
-from .numeric_limits import FloatArray
+from .numeric_limits import FloatArray, modulus
 
 ORDER = 512
 MODELS = ("jepsen", "lopezpoveda")
@@ -80,7 +80,7 @@ def _frequency_sampling(frequencies: FloatArray, amplitudes: FloatArray) -> Floa
 def _jepsen(nyquist: float) -> FloatArray:
     frequencies, impedances = STAPES_IMPEDANCE[STAPES_IMPEDANCE[:, 0] < nyquist].T
     fir = _frequency_sampling(np.r_[0.0, frequencies, nyquist], np.r_[0.0, 1 / impedances, 0.0])
-    fir /= np.abs(scipy.fft.fft(fir)).max()
+    fir /= modulus(scipy.fft.fft(fir)).max()
     return fir * 1e-8 * 10 ** (REFERENCE_DB_SPL / 20)
 
 
@@ -105,7 +105,7 @@ def _lopezpoveda(nyquist: float) -> FloatArray:
 
 def _minimum_phase(fir: FloatArray) -> FloatArray:
     """Return the minimum phase response with the magnitude of `fir` on a grid of the same length."""
-    magnitude = np.maximum(np.abs(scipy.fft.fft(fir)), np.finfo(np.float64).tiny)
+    magnitude = np.maximum(modulus(scipy.fft.fft(fir)), np.finfo(np.float64).tiny)
     phase = -np.imag(scipy.signal.hilbert(np.log(magnitude)))
     response: FloatArray = scipy.fft.ifft(magnitude * np.exp(1j * phase)).real
     return response

@@ -48,6 +48,11 @@ def clamp(block: FloatArray, tiny: float = TINY) -> FloatArray:
     return result
 
 
+def modulus(values: NDArray[np.complex128]) -> FloatArray:
+    """Return the absolute values of complex numbers: those of np.abs are rounded differently by versions of numpy."""
+    return np.hypot(values.real, values.imag)
+
+
 def flush_denormals(state: NDArray[Any]) -> None:
     """Set numbers below TINY in a contiguous real or complex `state` to 0, in place."""
     parts = state.view(np.float64)

@@ -16,7 +16,7 @@ from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import MAX_FRAME_SECONDS, FrameBuffer, FramedStage, FrameGrid, batches
-from rosafe.dsp.numeric_limits import FLUSH_INTERVAL, FloatArray, clamp
+from rosafe.dsp.numeric_limits import FLUSH_INTERVAL, FloatArray, clamp, modulus
 from rosafe.dsp.rounding import sample_count
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.sos_filter import SosFilterBank
@@ -203,7 +203,7 @@ class AmsFeatures(FramedStage):
         result = np.empty((len(frames), channels, triangles.shape[1], count))
         points = transform_points(len(self.window))
         for some, part in batches(channels, count, points):
-            spectra = np.abs(scipy.fft.rfft(frames[:, some, part] * self.window, points)[..., : len(triangles)])
+            spectra = modulus(scipy.fft.rfft(frames[:, some, part] * self.window, points)[..., : len(triangles)])
             # not a matrix product: see `FrameGrid.means`
             result[:, some, :, part] = np.einsum("ecfb,bm->ecmf", spectra, triangles)
         return result

@@ -17,7 +17,7 @@ from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Derived, Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer
-from rosafe.dsp.numeric_limits import EPSILON, FloatArray
+from rosafe.dsp.numeric_limits import EPSILON, FloatArray, modulus
 from rosafe.dsp.rounding import round_half_away
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
@@ -213,7 +213,7 @@ def patterns(channels: int) -> Patterns:
         for channel in range(channels // 2 % step, channels, step):
             first, stop = max(0, channel - half), min(channels, channel + half + 1)
             cut = mirrored[first - channel + half : stop - channel + half]
-            weight, size = cut.real, np.abs(cut)
+            weight, size = cut.real, modulus(cut)
             if (g.real < 0).any():
                 weight = weight - size * (weight.sum() / size.sum())
             places.append((first, stop - first, reach, begin))
@@ -264,7 +264,7 @@ def _filter(time: tuple[float, float], channel: tuple[float, float]) -> NDArray[
     envelope = np.outer(*envelopes)
     g: NDArray[np.complex128] = envelope * np.exp(1j * np.add.outer(*phases))
     g = g - envelope * (g.mean() / envelope.mean()) if time[1] or channel[1] else g * (1 + 1j)
-    return g / np.abs(scipy.fft.fft2(g)).max()
+    return g / modulus(scipy.fft.fft2(g)).max()
 
 
 # --- features of frames -----------------------------------------------------------------------------------------
