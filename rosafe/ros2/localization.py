@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 import functools
 import math
 import threading
@@ -12,7 +13,7 @@ import numpy as np
 from geometry_msgs.msg import Pose, PoseArray
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rosafe_msgs.msg import DirectionPosterior, SoundSource, SoundSources
+from rosafe_msgs.msg import DirectionPosterior, SoundSource, SoundSources, SourceAudio
 from std_msgs.msg import Header
 
 from rosafe.dsp.framing import FrameGrid
@@ -30,12 +31,16 @@ from rosafe.localization.live import (
     LocalizationLoop,
     Mute,
     NewFrames,
+    Status,
     StreamRestartedError,
 )
+from rosafe.localization.live_streams import LiveSound, LiveStreams
 from rosafe.localization.localizer import Localizer
 from rosafe.localization.settings import LocalizerSettings, Models
+from rosafe.localization.speech import SPEAKS
 from rosafe.localization.status import NodeStatus
 from rosafe.localization.stored_noise import StoredNoise
+from rosafe.localization.streams import RATE, SourcePart
 from rosafe.localization.tracker import FORGOTTEN, PRESENT, Track
 from rosafe.ros2.messages import numbers, ros_time
 from rosafe.ros2.outputs import QUEUE, FramePosition
@@ -44,6 +49,7 @@ from rosafe.tree.processor import Processor
 
 CHECK_SECONDS = 0.5  # between two checks of the processors
 MAX_FRAMES = 10_000  # that wait for the thread that localizes
+MAX_PARTS = 200  # of streams for a slow subscriber: at least a second; older ones are dropped
 
 
 class TreeFrames:
@@ -146,36 +152,69 @@ def _slice(parts: list[tuple[int, FloatArray]], first: int, end: int) -> FloatAr
 
 
 class SourcePublishers:
-    """Publishes sources, poses and the posterior.
+    """Publishes sources, poses, the posterior, and the sound of each source.
 
     Parameters
     ----------
     node : Node
     frame_id : str
         Coordinate frame of all azimuths.
+    speech_only : bool
+        Whether only sources that speak have poses.
+
+    Attributes
+    ----------
+    streams : LiveStreams
+        Provides the probability that a source speaks.
     """
 
-    def __init__(self, node: Node, frame_id: str) -> None:
-        self._frame_id = frame_id
+    streams: LiveStreams
+
+    def __init__(self, node: Node, frame_id: str, speech_only: bool = False) -> None:
+        self._frame_id, self._speech_only = frame_id, speech_only
         self._first_id = self._last_id = 0
         topics = {"sources": SoundSources, "poses": PoseArray, "posterior": DirectionPosterior}
         self._publishers = {
             name: node.create_publisher(message, f"~/{name}", QoSProfile(depth=QUEUE))
             for name, message in topics.items()
         }
+        self._parts = node.create_publisher(SourceAudio, "~/streams", QoSProfile(depth=MAX_PARTS))
 
     def begin_again(self) -> None:
         """Prepare for tracks that are numbered from 1 again: published ids continue."""
         self._first_id = self._last_id
+        self.streams.begin_again(self._first_id)
+
+    def has_stream_subscribers(self) -> bool:
+        """Return whether the sound of sources is used."""
+        return bool(self._parts.get_subscription_count())
+
+    def has_speech_subscribers(self) -> bool:
+        """Return whether the probability that a source speaks is used."""
+        names = ("sources", "poses") if self._speech_only else ("sources",)
+        return any(self._publishers[name].get_subscription_count() for name in names)
+
+    def publish_part(self, part: SourcePart, time: float) -> None:
+        """Publish the next samples of a source, of which the first is that of a clock time (s)."""
+        if self.has_stream_subscribers():
+            message = SourceAudio(
+                header=Header(stamp=ros_time(time), frame_id=self._frame_id),
+                id=part.id,
+                azimuth=math.radians(part.azimuth),
+                sample_rate=RATE,
+                first_sample=part.first_sample,
+                samples=array.array("h", part.samples.tobytes()),
+            )
+            self._parts.publish(message)
 
     def publish(self, time: float, tracks: Sequence[Track], gain_db: float, estimate: tuple[Any, Any]) -> None:
         """Publish the state at a clock time (s); see `Publishing`."""
         header = Header(stamp=ros_time(time), frame_id=self._frame_id)
         named = [track for track in tracks if track.id and track.probability >= FORGOTTEN]
         self._last_id = max([self._last_id, *(self._first_id + track.id for track in named)])
-        present = [track for track in named if track.probability > PRESENT]
+        posed = [track for track in named if track.probability > PRESENT and self._has_pose(track)]
         self._send("sources", header, lambda: {"sources": [self._source(track, gain_db) for track in named]})
-        self._send("poses", header, lambda: {"poses": [_pose(track.azimuth) for track in present]})
+        self._send("poses", header, lambda: {"poses": [_pose(track.azimuth) for track in posed]})
         self._send(
             "posterior",
             header,
@@ -187,6 +226,12 @@ class SourcePublishers:
         if publisher.get_subscription_count():
             publisher.publish(publisher.msg_type(header=header, **fields()))
 
+    def _speech(self, track: Track) -> float:
+        return self.streams.speech(self._first_id + track.id)
+
+    def _has_pose(self, track: Track) -> bool:
+        return not self._speech_only or self._speech(track) > SPEAKS
+
     def _source(self, track: Track, gain_db: float) -> SoundSource:
         return SoundSource(
             id=self._first_id + track.id,
@@ -196,7 +241,7 @@ class SourcePublishers:
             level=float(track.level_db(gain_db)),
             first_seen=ros_time(track.first_time),
             last_seen=ros_time(track.last_time),
-            speech=math.nan,
+            speech=self._speech(track),
         )
 
 
@@ -221,6 +266,8 @@ class Localization:
         None: azimuths are relative to the head.
     clock : callable
         Returns the clock time in s.
+    open_sound : callable
+        Opens the sound at a sample rate (Hz), of which the sources are separated.
 
     Raises
     ------
@@ -236,8 +283,9 @@ class Localization:
         status: NodeStatus,
         head: HeadRotation | None,
         clock: Callable[[], float],
+        open_sound: Callable[[float, Status], LiveSound],
     ) -> None:
-        self._tree, self._status = tree, status
+        self._tree, self._status, self._open_sound = tree, status, open_sound
         self._models = Models(settings)
         self._models.report = self._report_learning
         noise = StoredNoise(settings.noise, status)
@@ -246,7 +294,10 @@ class Localization:
         self._closing = threading.Event()
         self._wake = threading.Event()
         create = functools.partial(_localizer, settings.seconds, noise)
-        self._loop = LocalizationLoop(create, publishers, queue, status, self._wake.set, clock)
+        self._streams = publishers.streams = LiveStreams(
+            publishers.publish_part, publishers.has_stream_subscribers, publishers.has_speech_subscribers, status
+        )
+        self._loop = LocalizationLoop(create, publishers, queue, status, self._wake.set, clock, self._streams.update)
         self._watched: dict[Processor, Mapping[str, Any]] = {}
         self._created: list[str] = []
         self._thread = threading.Thread(target=self._run, name="localizer", daemon=True)
@@ -254,6 +305,7 @@ class Localization:
     def start(self) -> None:
         """Start the threads."""
         self._loop.start()
+        self._streams.start()
         self._thread.start()
 
     def check_now(self) -> None:
@@ -266,6 +318,7 @@ class Localization:
         self._wake.set()
         self._thread.join(1.0)
         self._loop.close()
+        self._streams.close()
 
     def _report_learning(self, part: float) -> None:
         if self._closing.is_set():
@@ -303,6 +356,7 @@ class Localization:
         format_ = FrameFormat(rate, model.channels, len(grid.window), grid.hop, self._tree.block())
         names = ", ".join(processor.name for processor in processors.values())
         self._status.set("rosAFE", OK, f"localizing with {names}")
+        self._streams.connect(model, functools.partial(self._open_sound, rate, self._status))
         self._loop.connect(model, lambda received: self._open(processors, format_, received))
 
     def _request(self, model: DirectionModel) -> dict[str, Processor]:
@@ -327,6 +381,7 @@ class Localization:
         if self._watched:
             self._watched = {}
             self._loop.connect(None)
+            self._streams.connect(None)
             self._tree.consumers.clear()
             self._tree.remove_unused(self._created)
             self._created = []

@@ -51,7 +51,7 @@ from rosafe.ros2.messages import diagnostics
 from rosafe.ros2.node_tree import NodeTree
 from rosafe.ros2.outputs import Outputs, topics_of
 from rosafe.ros2.parameters import ProcessorParameters
-from rosafe.ros2.sound import Sound
+from rosafe.ros2.sound import SeparatedSound, Sound
 from rosafe.ros2.sound_topic import open_device
 from rosafe.system.input import read_regular
 from rosafe.system.log_throttle import ThrottledLog
@@ -233,8 +233,9 @@ class RosafeNode:
             transforms.subscribe(self.node, buffer)
             names = settings.world_frame, settings.head_frame, settings.audio_delay
             head = TransformedHead(buffer, *names, self._status)
-        publishers = SourcePublishers(self.node, settings.frame_id)
-        localization = Localization(settings, self.tree, publishers, self._status, head, self.now)
+        publishers = SourcePublishers(self.node, settings.frame_id, settings.speech_only)
+        open_sound = functools.partial(SeparatedSound, self.sound)
+        localization = Localization(settings, self.tree, publishers, self._status, head, self.now, open_sound)
         self._localizer, self._localization = dict(given), localization
         localization.start()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import threading
 import time
 from collections import deque
@@ -16,8 +17,10 @@ from rosafe.audio.devices.alsa import DeviceBusyError
 from rosafe.audio.stream.capture import Capture, Snapshot
 from rosafe.audio.stream.frame_clock import LinearClock
 from rosafe.audio.stream.ring import AudioReader, AudioRing
+from rosafe.audio.stream.ring_sound import BEFORE_SECONDS, RingSound, loss_report
 from rosafe.audio.stream.truth import TruthLoop, TruthSource
 from rosafe.interface import ROSAFE, ComponentError
+from rosafe.localization.live import Status
 from rosafe.system.log_throttle import ThrottledLog
 from rosafe.tree.block import Source
 from rosafe.tree.health import ERROR, OK, WARN
@@ -125,6 +128,7 @@ class Sound:
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._feed: Callable[[Any], None] = lambda message: None
+        self._other_feeds: list[Callable[[Any], None]] = []
         self._line: LinearClock | None = None  # the clock of the newest frames
 
     # --- acquisition ---
@@ -225,7 +229,20 @@ class Sound:
         if new.time_ns:
             known = self.ring.captured(index) if index > new.frames_per_chunk else None
             self._line = known or LinearClock(index, seconds, new.sample_rate)
-        self._feed(window)
+        for feed in (self._feed, *self._other_feeds):
+            feed(window)
+
+    def connect(self, ring: AudioRing) -> Callable[[], None]:
+        """Fill another ring, too, from the last second on, until the returned function is called."""
+        feed = ring.connect()
+        with self.ring.lock:
+            frames, rate = self.ring.frames, self.ring.sample_rate
+            count = min(frames.newest + 1 - frames.oldest, round(BEFORE_SECONDS * rate))
+            if count:
+                left, right = frames.copy(frames.newest + 1 - count, count)
+                feed(_Window(rate, 1, count, frames.newest, left, right, {"sec": 0, "nsec": 0}))
+            self._other_feeds.append(feed)
+        return functools.partial(self._other_feeds.remove, feed)
 
     def clock_time(self, seconds: float) -> float:
         """Return the clock time of the node for a time of the system's clock (s)."""
@@ -264,3 +281,26 @@ class Sound:
         status.add("frames waiting", self.ring.behind)
         for name, value in vars(counters).items():
             status.add(name.replace("_", " "), value)
+
+
+class SeparatedSound(RingSound):
+    """The sound of which the localizer separates the sources, in a ring of its own: it may be read late.
+
+    Parameters
+    ----------
+    sound : Sound
+    sample_rate : float
+        Hz; sound at another rate is not read.
+    status : Status
+        Warns about lost sound.
+    """
+
+    def __init__(self, sound: Sound, sample_rate: float, status: Status) -> None:
+        ring = AudioRing(loss_report(status))
+        super().__init__(ring, sample_rate, sound.time_of)
+        self._disconnect = sound.connect(ring)
+
+    def close(self) -> None:
+        """End."""
+        self._disconnect()
+        super().close()
