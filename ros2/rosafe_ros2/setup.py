@@ -19,5 +19,5 @@ setup(
         (f'share/{NAME}/launch', ['launch/rosafe.launch.py']),
     ],
     zip_safe=False,
-    entry_points={'console_scripts': ['rosafe = rosafe.ros2.node:main']},
+    entry_points={'console_scripts': ['rosafe = rosafe.ros2.node:run']},
 )

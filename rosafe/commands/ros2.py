@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 from rosafe.commands import CommandError
+from rosafe.ros1.transport.paths import PYPI_DIR
 from rosafe.system import missing
 
 _NODE = "rosafe.ros2.node"
@@ -41,8 +42,8 @@ def run(options: argparse.Namespace) -> int:
             raise CommandError(missing.advice(module))
     folder = str(Path(__file__).parents[2])
     environ = {**os.environ, "PYTHONSAFEPATH": "1"}  # without the working directory
-    if folder not in site.getsitepackages():  # there, messages of ROS 1 could come before those of ROS 2
-        environ["PYTHONPATH"] = os.pathsep.join(filter(None, (folder, environ.get("PYTHONPATH"))))
+    own = [] if folder in site.getsitepackages() else [folder]  # there, messages of ROS 1 could come before the others
+    environ["PYTHONPATH"] = os.pathsep.join(filter(None, (*own, environ.get("PYTHONPATH"), str(PYPI_DIR))))
     sys.stdout.flush()
     # A new program, since this one has imported modules of ROS 1
     os.execve(sys.executable, [sys.executable, "-m", _NODE, "--ros-args", *options.ros_args], environ)  # noqa: S606

@@ -75,6 +75,7 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "head": ("sphere", "Head: sphere, a SOFA file or a learned model"),
     "world_frame": ("", "Coordinate frame of the azimuths, by tf2; empty: they are relative to the head"),
     "frame_id": ("head", "Coordinate frame of the head: x ahead, y left, z up"),
+    "speech_only": (False, "Whether only sources that speak have poses"),
     "keep": ("", "File to which the setup is saved at each change, and from which it is restored"),
 }
 
@@ -224,7 +225,7 @@ class RosafeNode:
 
     def _localize(self, given: Mapping[str, Any]) -> None:
         """Start the localizer with the settings of a setup, or else those of the parameters."""
-        own = {"head": self._values["head"], "world_frame": self._values["world_frame"]}
+        own = {name: self._values[name] for name in ("head", "world_frame", "speech_only")}
         settings = checked_settings({**own, "head_frame": self._values["frame_id"], **given})
         head = None
         if settings.world_frame:

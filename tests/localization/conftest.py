@@ -7,13 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.signal
+import soundfile
 
 from rosafe.localization import training
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.head import Head
 from tests import harness, models
 
+from .sounds import RECORDINGS, music
+
 RATE = 16000
+TALKER, MUSIC = 30.0, -40.0  # degrees, in `take`
 KEMAR = Path("/usr/share/libmysofa/MIT_KEMAR_normal_pinna.sofa")
 
 
@@ -23,6 +28,25 @@ def sphere_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "sphere.head"
     models.learn(tmp_path_factory, RATE).save(path)
     return path
+
+
+@pytest.fixture(scope="module")
+def take(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """Return a recording of a talker and music, and both parts of it (2, 2, N)."""
+    paths = sorted(RECORDINGS.glob("*_*.wav"))
+    if not paths:
+        pytest.skip("Debian's alsa-utils is not installed")
+    speech = np.concatenate(
+        [scipy.signal.resample_poly(sound, RATE, rate) for sound, rate in map(soundfile.read, paths)]
+    )
+    tune = music(6.0, 4)
+    speech = np.resize(speech, len(tune))
+    head = Head.sphere()
+    sources = (0.08 * speech / np.std(speech), TALKER), (0.04 * tune / np.std(tune), MUSIC)
+    parts = [head.render(dry, RATE, azimuth) for dry, azimuth in sources]
+    path = tmp_path_factory.mktemp("take") / "take.wav"
+    soundfile.write(path, np.sum(parts, axis=0).T, RATE, subtype="PCM_32")
+    return path, np.array(parts)
 
 
 @pytest.fixture(scope="session")

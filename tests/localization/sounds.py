@@ -1,8 +1,12 @@
-"""Sounds that are no speech."""
+"""Music, and recordings of speech."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+
+RECORDINGS = Path("/usr/share/sounds/alsa")  # of Debian's alsa-utils
 
 
 def music(seconds: float, seed: int, rate: int = 16000) -> np.ndarray:

@@ -15,8 +15,7 @@ from rosafe.localization import enhancement
 from rosafe.localization.head import Head
 from rosafe.localization.training import _training_sound
 from tests.localization.conftest import RATE
-
-RECORDINGS = Path("/usr/share/sounds/alsa")
+from tests.localization.sounds import RECORDINGS
 
 
 def si_sdr(estimate: np.ndarray, reference: np.ndarray) -> np.ndarray:

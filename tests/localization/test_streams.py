@@ -21,8 +21,8 @@ from rosafe.localization.streams import RATE, SourcePart, SourceStreams
 from rosafe.localization.tracker import Track
 from rosafe.ros1.transport.paths import PYPI_DIR
 from tests.localization.conftest import modulated
-from tests.localization.sounds import music
-from tests.localization.test_enhancement import RECORDINGS, si_sdr, talkers
+from tests.localization.sounds import RECORDINGS, music
+from tests.localization.test_enhancement import si_sdr, talkers
 
 
 def track(id_: int, azimuth: float, velocity: float = 0.0, log_odds: float = 2.0) -> Track:

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
+from rosafe.ros1.transport.paths import PYPI_DIR
 from tests.harness import PATIENCE, wait_for
 
 from .client import Client, joined
@@ -120,3 +122,23 @@ def test_sound_of_another_driver(ros2: Network, tmp_path: Path) -> None:
     finally:
         finished.set()
     assert np.allclose(found[:, 5:], -20 * np.log10(2), atol=0.01)
+
+
+def test_sound_card_through_libasound(ros2: Network, tmp_path: Path) -> None:
+    """A PCM of the machine's configuration; the command finds the working pyalsaaudio, as the nodes of ROS 1 do."""
+    if not any(PYPI_DIR.glob("alsaaudio*")):
+        pytest.skip("pyalsaaudio is not here: scripts/install brings it")
+    noise = np.random.default_rng(1).integers(-(2**28), 2**28, RATE).astype("<i4")
+    np.stack((2 * noise, noise), axis=1).tofile(tmp_path / "samples.raw")
+    (tmp_path / "asound.conf").write_text(
+        "</usr/share/alsa/alsa.conf>\n"
+        f'pcm.recorded {{ type file slave.pcm "null" file /dev/null infile "{tmp_path}/samples.raw" format raw }}\n'
+    )
+    ros2.node("representations:=[ild]", "frames_per_block:=160", ALSA_CONFIG_PATH=str(tmp_path / "asound.conf"))
+    client = Client(ros2, tmp_path)
+    client.subscribe("ild")
+    answer = client.call("acquire", device="nosuch", sample_rate=RATE)
+    assert not answer["success"] and "Unknown PCM nosuch" in answer["message"]
+    assert client.call("acquire", device="recorded", sample_rate=RATE) == {"success": True, "message": ""}
+    found = np.array(client.take("ild")[0]["data"])
+    assert np.allclose(found, -20 * np.log10(2), atol=0.01), found

@@ -31,7 +31,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 NODE = ["device", "frame_id", "frames_per_block", "head", "keep", "localize", "representations", "sample_rate", "setup"]
-NODE += ["start_type_description_service", "use_sim_time", "world_frame"]
+NODE += ["speech_only", "start_type_description_service", "use_sim_time", "world_frame"]
 EVERY = [kind.kind for kind in KINDS.values() if kind.parent]
 OTHERS = {
     "gammatone.fb_type": "drnl",

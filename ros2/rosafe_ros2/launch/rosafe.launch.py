@@ -17,6 +17,7 @@ ARGUMENTS = {
     'head': (str, 'head of the localizer: SOFA file, learned model, pair:METRES or sphere'),
     'world_frame': (str, 'coordinate frame of the directions, from tf; empty: that of the head'),
     'frame_id': (str, 'coordinate frame of the head'),
+    'speech_only': (bool, 'only sources that speak have poses'),
     'keep': (str, 'file in which the node stores its tree, to restore it at the next start'),
     'use_sim_time': (bool, 'use the time of /clock'),
 }

@@ -18,37 +18,16 @@ import scipy.signal
 import soundfile
 
 import rosafe
-from rosafe.localization.head import Head
 from rosafe.ros1.localizer.publishers import source_markers
 from rosafe.ros1.localizer.sound import InputSound
 from rosafe.ros1.transport.paths import PYPI_DIR
 from tests.harness import PYTHON, ROOT, Graph, Process, wait_for
-from tests.localization.sounds import music
-from tests.localization.test_enhancement import RECORDINGS, si_sdr
+from tests.localization.conftest import MUSIC, TALKER, take
+from tests.localization.test_enhancement import si_sdr
 from tests.ros1.localizer.conftest import RATE
 from tests.ros1.localizer.session import Localizer, acquire
 
-SECONDS = 6.0
-TALKER, MUSIC = 30.0, -40.0  # degrees
-
-
-@pytest.fixture(scope="module")
-def take(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
-    """Return a recording of a talker and music, and both parts of it (2, 2, N)."""
-    paths = sorted(RECORDINGS.glob("*_*.wav"))
-    if not paths:
-        pytest.skip("Debian's alsa-utils is not installed")
-    speech = np.concatenate(
-        [scipy.signal.resample_poly(sound, RATE, rate) for sound, rate in map(soundfile.read, paths)]
-    )
-    speech = np.resize(speech, round(SECONDS * RATE))
-    tune = music(SECONDS, 4)
-    head = Head.sphere()
-    sources = (0.08 * speech / np.std(speech), TALKER), (0.04 * tune / np.std(tune), MUSIC)
-    parts = [head.render(dry, RATE, azimuth) for dry, azimuth in sources]
-    path = tmp_path_factory.mktemp("take") / "take.wav"
-    soundfile.write(path, np.sum(parts, axis=0).T, RATE, subtype="PCM_32")
-    return path, np.array(parts)
+__all__ = ["take"]
 
 
 def joined(messages: list[Any], id_: int) -> np.ndarray:
