@@ -7,7 +7,9 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from rosafe.system.terminal import printable
 
 CACHE_SECONDS = 10.0  # of rotations
 MAX_FRAMES = 1000  # coordinate frames
@@ -72,6 +74,8 @@ class _Frame:
 class RotationBuffer:
     """The rotations between two coordinate frames, interpolated in time. Safe from any thread.
 
+    Rotations that change are kept only for the two and those above them: a robot publishes hundreds of others.
+
     Parameters
     ----------
     world, head : str
@@ -84,6 +88,7 @@ class RotationBuffer:
         self._world, self._head, self._report = world, head, report
         self._lock = threading.Lock()
         self._frames: dict[str, _Frame] = {}
+        self._relevant = {world, head}
 
     def clear(self) -> None:
         """Forget all rotations except the static ones."""
@@ -95,14 +100,20 @@ class RotationBuffer:
             if not frame.static:
                 frame.turns.clear()
 
+    def add_message(self, message: Any, static: bool, seconds: Callable[[Any], float]) -> None:
+        """Add the transforms of a message of /tf or, `static`, of /tf_static; `seconds` returns a stamp in s."""
+        for one in message.transforms:
+            shift, turn = one.transform.translation, one.transform.rotation
+            time = seconds(one.header.stamp) if math.isfinite(shift.x + shift.y + shift.z) else math.nan
+            self.add(one.child_frame_id, one.header.frame_id, time, (turn.x, turn.y, turn.z, turn.w), static)
+
     def add(self, child: str, parent: str, time: float, rotation: Quaternion, static: bool) -> None:
         """Add the rotation of `child` relative to `parent` at a clock time in s."""
         child, parent = child.lstrip("/"), parent.lstrip("/")
         norm = math.sqrt(sum(min(abs(part), 1e3) ** 2 for part in rotation))
         named = child and parent and child != parent and max(len(child), len(parent)) <= MAX_NAME
         if not named or not abs(norm * norm - 1) < _NORM_TOLERANCE or not math.isfinite(time):
-            name = child[:MAX_NAME].encode("ascii", "replace").decode()
-            self._report(f"/tf: the transform of {name!r} is not valid and ignored", "invalid")
+            self._report(f"/tf: the transform of {printable(child)[:MAX_NAME]} is not valid and ignored", "invalid")
             return
         x, y, z, w = rotation
         with self._lock:
@@ -112,6 +123,9 @@ class RotationBuffer:
                 return
             if frame is None or frame.parent != parent or frame.static != static:
                 frame = self._frames[child] = _Frame(parent, static)
+                self._relevant = {*self._chain(self._world), *self._chain(self._head)}
+            if not static and child not in self._relevant:
+                return
             if frame.is_long_after(time):
                 self._clear()
             frame.add(Turn(time, (x / norm, y / norm, z / norm, w / norm)))

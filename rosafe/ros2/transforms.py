@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from collections.abc import Callable
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -20,18 +22,13 @@ from rosafe.ros2.messages import ros_time
 def subscribe(node: Node, buffer: RotationBuffer) -> None:
     """Fill a buffer from /tf and /tf_static."""
     latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    node.create_subscription(TFMessage, "/tf", _adding(buffer, static=False), QoSProfile(depth=100))
-    node.create_subscription(TFMessage, "/tf_static", _adding(buffer, static=True), latched)
+    for topic, static, qos in (("/tf", False, QoSProfile(depth=100)), ("/tf_static", True, latched)):
+        add = functools.partial(buffer.add_message, static=static, seconds=_seconds)
+        node.create_subscription(TFMessage, topic, add, qos)
 
 
-def _adding(buffer: RotationBuffer, static: bool) -> Callable[[Any], None]:
-    def add(message: Any) -> None:
-        for one in message.transforms:
-            stamp, turn = one.header.stamp, one.transform.rotation
-            seconds = stamp.sec + 1e-9 * stamp.nanosec
-            buffer.add(one.child_frame_id, one.header.frame_id, seconds, (turn.x, turn.y, turn.z, turn.w), static)
-
-    return add
+def _seconds(stamp: Time) -> float:
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 class TruthTopics:

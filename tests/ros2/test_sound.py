@@ -105,11 +105,14 @@ def test_rotations_are_those_of_slerp() -> None:
     times = np.array([0.0, 0.5, 1.25])
     base, neck = Rotation.random(3, random_state=1), Rotation.random(3, random_state=2)
     fixed = Rotation.random(random_state=3)
+    buffer.add("head", "neck", 0.0, tuple(fixed.as_quat()), static=True)
+    buffer.add("neck", "base", 0.0, (0.0, 0.0, 0.0, 1.0), static=False)
     for index in (0, 2, 1):  # one is late
         for child, parent, turn in (("base", "map", base), ("/neck", "base", neck)):
             buffer.add(child, parent, times[index], tuple(-turn[index].as_quat()), static=False)
-    assert buffer.rotation(0.3) is None
-    buffer.add("head", "neck", 0.0, tuple(fixed.as_quat()), static=True)
+            buffer.add("arm", "base", times[index], (0.0, 0.0, 0.0, 1.0), static=False)
+        assert index or buffer.rotation(0.3) is None
+    assert not buffer._frames["arm"].turns, "it is not above the head"
     for moment in (0.0, 0.3, 0.5, 1.0, 1.25):
         expected = Slerp(times, base)(moment) * Slerp(times, neck)(moment) * fixed
         found = buffer.rotation(moment)
