@@ -110,9 +110,11 @@ def launch(monkeypatch: pytest.MonkeyPatch, **given: str) -> tuple[dict[str, str
     modules: dict[str, dict[str, Callable[..., Any]]] = {
         "launch": {"LaunchDescription": record},
         "launch.actions": {"DeclareLaunchArgument": record, "OpaqueFunction": record},
+        "launch.substitutions": {"LaunchConfiguration": record},
         "launch_ros": {},
         "launch_ros.actions": {"Node": record},
-        "launch_ros.parameter_descriptions": {"ParameterValue": lambda value, value_type: (value, value_type)},
+        # the value has to be a substitution: launch_ros converts no other text to another type
+        "launch_ros.parameter_descriptions": {"ParameterValue": lambda value, value_type: (*value.values, value_type)},
     }
     for name, content in modules.items():
         module = ModuleType(name)
@@ -130,5 +132,5 @@ def test_launch_file(monkeypatch: pytest.MonkeyPatch) -> None:
     arguments, node = launch(monkeypatch, device="scene:", localize="true", namespace="robot1")
     assert set(arguments.values()) == {""}
     assert (node.package, node.executable, node.namespace) == ("rosafe_ros2", "rosafe", "robot1")
-    assert node.parameters == [{"device": ("scene:", str), "localize": ("true", bool)}]
+    assert node.parameters == [{"device": ("device", str), "localize": ("localize", bool)}]
     assert launch(monkeypatch)[1].parameters == [{}]

@@ -4,6 +4,7 @@ from typing import List
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
@@ -27,7 +28,7 @@ def nodes(context):
     """Return the node with the arguments that were given; the others have the node's defaults."""
     given = context.launch_configurations
     parameters = {
-        name: ParameterValue(given[name], value_type=kind)
+        name: ParameterValue(LaunchConfiguration(name), value_type=kind)
         for name, (kind, _) in ARGUMENTS.items() if given[name]
     }
     return [Node(
