@@ -15,7 +15,7 @@ from rosafe.dsp.copies import OwnState
 from rosafe.dsp.gammatone_synthesis import ComplexArray
 
 _DELAY = 2  # frames from the sound that is predicted back to the newest one that predicts it
-_TAPS = 6  # frames that predict it
+_TAPS = 4  # frames that predict it
 _KEPT = 0.997  # weight of the past, for each frame
 _SILENCE = 1e-9  # power of a frame and bin of sound with full scale 1, below which nothing is learned
 
@@ -45,8 +45,8 @@ class Dereverberator(OwnState):
         energy = np.maximum(np.sum(past.conj() * projected, axis=1, keepdims=True).real, 0.0)
         gain = projected / (_KEPT * power + energy)
         self._prediction += early * gain.conj().transpose(0, 2, 1)
-        self._inverse = (self._inverse - gain * projected.conj().transpose(0, 2, 1)) / _KEPT
+        self._inverse -= gain * projected.conj().transpose(0, 2, 1)
         # without sound, or with a tone only, it would grow without a limit
         size = np.einsum("kii->k", self._inverse).real / self._inverse.shape[1]
-        self._inverse /= np.maximum(size, 1.0)[:, np.newaxis, np.newaxis]
+        self._inverse *= (1 / np.maximum(size, _KEPT))[:, np.newaxis, np.newaxis]
         return np.asarray(early[..., 0].T)

@@ -1,5 +1,4 @@
-"""The sound of each tracked source, while the sound arrives: late reverberation is subtracted, a spatial filter and a mask
-select the source.
+"""The sound of each tracked source while the sound arrives: without late reverberation, by a spatial filter and a mask.
 
 The mask of a source is the likelihood of the cues of a frame and channel for its direction, relative to those for the
 directions of the other sources and of diffuse sound (M. I. Mandel, R. J. Weiss and D. P. W. Ellis, 2010, "Model-based
@@ -40,8 +39,8 @@ BEFORE = 0.6  # s with which a stream begins, from before its source was found
 _MAX_FREQUENCY = 0.48 * RATE  # Hz, of a channel
 _DIFFUSE = 0.3  # weight of diffuse sound, relative to a source
 _LEAST = 1e-4  # added to likelihoods
-# Of the mask, as a function of the logarithm of the likelihood ratio of a unit: they minimize the squared error of streams
-# of two talkers, 60 degrees apart, without a room and in rooms at 5 dB.
+# Of the mask, as a function of the logarithm of the likelihood ratio of a unit: they minimize the squared error of the
+# streams of two talkers, 60 degrees apart, without a room and in rooms at 5 dB.
 _OFFSET, _SLOPE = 0.26, 0.58
 _EAR_DEGREES = 15.0  # of the margin of the other ear, until it is used
 _EAR_RATE = 0.02  # of the margin, for each frame
@@ -213,10 +212,12 @@ class SourceStreams:
     def _add_frame(self, rows: _Rows) -> None:
         """Add the next frame to those that are kept."""
         spectrum = self._dereverberator.process(spatial_filter.spectrum(self._sound[:, :SIZE]))
-        self._total = KEPT * self._total + (1 - KEPT) * spatial_filter.covariance(spectrum)
+        covariance = (1 - KEPT) * spatial_filter.covariance(spectrum)
+        self._total = KEPT * self._total + covariance
         time = (self._begin(self._count) + 2 * HOP) / RATE
         state = self._state(time)
-        self._frames.append(_Frame(self._count, spectrum, self._total, rows, state.yaw_at(time), state.azimuths(time)))
+        place = state.yaw_at(time), state.azimuths(time)
+        self._frames.append(_Frame(self._count, spectrum, covariance, self._total, rows, *place))
 
     def _begin(self, number: int) -> int:
         """Return the number of the first sample of a frame."""
@@ -232,12 +233,8 @@ class SourceStreams:
             frames: Iterable[_Frame] = [newest]
         else:
             azimuth = newest.places[id_]
-            known = (
-                source.end if source else -(self._begin(0) // HOP)
-            )  # a stream begins with the sound, at the earliest
-            frames = [
-                frame._replace(places={**frame.places, id_: azimuth}) for frame in self._frames if frame.number >= known
-            ]
+            first = source.end if source else -(self._begin(0) // HOP)  # at the earliest, that with the first sample
+            frames = [frame.with_source(id_, azimuth) for frame in self._frames if frame.number >= first]
             if not frames:
                 return []
             if source is None:
@@ -303,14 +300,32 @@ class _Rows(NamedTuple):
 
 
 class _Frame(NamedTuple):
-    """A frame of sound: its number, spectrum (2, K), covariances (K, 2, 2), rows, yaw, and azimuths of the sources."""
+    """A frame of sound.
+
+    Attributes
+    ----------
+    number : int
+    spectrum : ndarray, (2, BINS)
+    covariance, total : ndarray, (BINS, 2, 2)
+        The part of the frame in the mean over the past, and this mean.
+    rows : _Rows
+    yaw : float
+        Direction of the head, degrees.
+    places : mapping
+        The azimuths of the sources in the world, by id.
+    """
 
     number: int
     spectrum: ComplexArray
+    covariance: ComplexArray
     total: ComplexArray
     rows: _Rows
     yaw: float
     places: Mapping[int, float]
+
+    def with_source(self, id_: int, azimuth: float) -> _Frame:
+        """Return the frame with the azimuth of another source."""
+        return self if id_ in self.places else self._replace(places={**self.places, id_: azimuth})
 
     def turned(self) -> dict[int, float]:
         """Return the azimuths relative to the head."""
@@ -336,6 +351,7 @@ class _Masks:
     def reset(self) -> None:
         """Forget all sound."""
         self._levels = np.empty((0, len(self._bins)))  # of the last frames, dB
+        self._last: tuple[_Frame | None, dict[int, FloatArray]] = None, {}
 
     def rows(self, features: Mapping[str, FloatArray]) -> list[_Rows]:
         """Return the rows of new frames."""
@@ -353,27 +369,27 @@ class _Masks:
             for number in range(len(found.level))
         ]
 
-    def mask(self, rows: _Rows, id_: int, azimuths: Mapping[int, float]) -> FloatArray:
-        """Return the mask (BINS,) of a source, one of those whose `azimuths` relative to the head are given.
+    def of(self, frame: _Frame) -> dict[int, FloatArray]:
+        """Return the masks (BINS,) of the sources of a frame.
 
         Sources at nearly equal lateral angles are not separated.
         """
-        terms = self._model.unweighted_terms(*rows)[0]
+        if self._last[0] is frame:
+            return self._last[1]
+        azimuths = frame.turned()
+        terms = self._model.unweighted_terms(*frame.rows)[0]
         likelihood = np.exp(terms - terms.max(axis=-1, keepdims=True), dtype=np.float64)
-        own = float(angles.lateral(azimuths[id_]))
-        wanted = self._mean(likelihood, np.abs(self._lateral - own) <= WIDTH + 1e-9)
-        rest = _DIFFUSE * self._mean(likelihood, np.abs(self._lateral - own) > WIDTH + GAP)
-        for other, azimuth in azimuths.items():
-            lateral = float(angles.lateral(azimuth))
-            apart = min(1.0, max(0.0, (abs(lateral - own) - WIDTH) / GAP))
-            if other != id_ and apart:
-                rest += apart * self._mean(likelihood, np.abs(self._lateral - lateral) <= WIDTH + 1e-9)
-        ratio = np.log((wanted + _LEAST) / (rest + _LEAST))
-        return np.asarray((1 / (1 + np.exp(-_OFFSET - _SLOPE * ratio))) @ self._bins)
-
-    @staticmethod
-    def _mean(likelihood: FloatArray, chosen: np.ndarray) -> FloatArray:
-        return np.asarray(likelihood[:, chosen].mean(axis=1))
+        laterals = angles.lateral(np.array(list(azimuths.values())))
+        distance = np.abs(self._lateral - laterals[:, np.newaxis])
+        wanted, diffuse = (
+            chosen / chosen.sum(axis=1, keepdims=True) @ likelihood.T
+            for chosen in (distance <= WIDTH + 1e-9, distance > WIDTH + GAP)
+        )
+        apart = np.clip((np.abs(laterals - laterals[:, np.newaxis]) - WIDTH) / GAP, 0.0, 1.0)
+        ratios = np.log((wanted + _LEAST) / (_DIFFUSE * diffuse + apart @ wanted + _LEAST))
+        masks = 1 / (1 + np.exp(-_OFFSET - _SLOPE * ratios)) @ self._bins
+        self._last = frame, dict(zip(azimuths, masks, strict=True))
+        return self._last[1]
 
 
 class _Source:
@@ -403,21 +419,19 @@ class _Source:
     @property
     def has_ended(self) -> bool:
         """Whether all following samples are zero, unless it is present again."""
-        return self._silent >= SIZE // HOP
+        return self._silent >= SIZE // HOP - 1
 
     def process(self, id_: int, frame: _Frame, masks: _Masks) -> FloatArray:
         """Return the HOP samples that are complete with the next frame."""
         azimuths = frame.turned()
         self._sum = np.append(self._sum[HOP:], np.zeros(HOP))
-        gap = frame.number - self.end
-        self._covariance *= KEPT ** (gap + 1 if self.end else 1)
+        self._covariance *= KEPT ** (frame.number + 1 - self.end)
         self.end = frame.number + 1
         self._silent += 1
         if id_ in azimuths:
             self._silent = 0
-            mask = masks.mask(frame.rows, id_, azimuths)
-            own = (1 - KEPT) * mask[:, np.newaxis, np.newaxis] * spatial_filter.covariance(frame.spectrum)
-            self._covariance += own
+            mask = masks.of(frame)[id_]
+            self._covariance += mask[:, np.newaxis, np.newaxis] * frame.covariance
             left = self._choose_ear(id_, azimuths)
             found = spatial_filter.separate(frame.spectrum, self._covariance, frame.total, left)
             self._sum += spatial_filter.overlap(found * mask)
