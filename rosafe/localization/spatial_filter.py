@@ -42,8 +42,8 @@ def bin_weights(frequencies: FloatArray, sample_rate: float) -> FloatArray:
 
 
 def covariance(frame: ComplexArray) -> ComplexArray:
-    """Return the covariance (BINS, 2, 2) of one frame (2, BINS)."""
-    return np.asarray(np.einsum("ak,bk->kab", frame, frame.conj()))
+    """Return the covariance (2, 2, BINS) of one frame (2, BINS)."""
+    return np.asarray(frame[:, np.newaxis] * frame.conj())
 
 
 def separate(frame: ComplexArray, wanted: ComplexArray, total: ComplexArray, left: float) -> ComplexArray:
@@ -53,7 +53,7 @@ def separate(frame: ComplexArray, wanted: ComplexArray, total: ComplexArray, lef
     ----------
     frame : ndarray, (2, BINS)
         Of both ears.
-    wanted, total : ndarray, (BINS, 2, 2)
+    wanted, total : ndarray, (2, 2, BINS)
         Covariances of the source and of all sound.
     left : float
         1 for the left ear, 0 for the right one; a value between them is between both.
@@ -69,12 +69,12 @@ def separate(frame: ComplexArray, wanted: ComplexArray, total: ComplexArray, lef
     of N cancels.
     """
     noise = total - wanted
-    power = np.einsum("kii->k", noise).real + _LOADING * np.einsum("kii->k", total).real
-    ratio = power[:, np.newaxis, np.newaxis] * wanted - noise @ wanted
-    trace = np.einsum("kii->k", ratio).real
-    product = (ratio[:, 0, 0] * ratio[:, 1, 1] - ratio[:, 0, 1] * ratio[:, 1, 0]).real
+    power = (noise[0, 0] + noise[1, 1] + _LOADING * (total[0, 0] + total[1, 1])).real
+    ratio = power * wanted - (noise[:, :, np.newaxis] * wanted).sum(axis=1)
+    trace = (ratio[0, 0] + ratio[1, 1]).real
+    product = (ratio[0, 0] * ratio[1, 1] - ratio[0, 1] * ratio[1, 0]).real
     root = np.sqrt(np.maximum(trace**2 / 4 - product, 0.0))
     rest = _UNFILTERED * trace + _TINY
-    ear = np.array([left, 1.0 - left])
-    weights = (ratio @ ear + (rest - trace / 2 + root)[:, np.newaxis] * ear) / (2 * root + rest)[:, np.newaxis]
-    return np.asarray(np.sum(weights.conj() * frame.T, axis=1))
+    ear = np.array([[left], [1.0 - left]])
+    weights = left * ratio[:, 0] + (1.0 - left) * ratio[:, 1] + (rest - trace / 2 + root) * ear
+    return np.asarray((weights.conj() * frame).sum(axis=0) / (2 * root + rest))

@@ -130,7 +130,7 @@ class SourceStreams:
         self._skipped = max(0, -self._lead)  # samples until then
         self._waiting: deque[_Rows] = deque()  # of the next frames
         self._dereverberator = Dereverberator(BINS)
-        self._total = np.zeros((BINS, 2, 2), np.complex128)
+        self._total = np.zeros((2, 2, BINS), np.complex128)
         self._frames: deque[_Frame] = deque(maxlen=round(BEFORE * RATE / HOP))
         self._count = 0
         self._states: deque[_State] = deque()
@@ -306,7 +306,7 @@ class _Frame(NamedTuple):
     ----------
     number : int
     spectrum : ndarray, (2, BINS)
-    covariance, total : ndarray, (BINS, 2, 2)
+    covariance, total : ndarray, (2, 2, BINS)
         The part of the frame in the mean over the past, and this mean.
     rows : _Rows
     yaw : float
@@ -410,7 +410,7 @@ class _Source:
     def __init__(self, begin: int, detect_speech: bool) -> None:
         self.begin, self.azimuth, self.end = begin, 0.0, 0
         self.detector = SpeechDetector() if detect_speech else None
-        self._covariance = np.zeros((BINS, 2, 2), np.complex128)
+        self._covariance = np.zeros((2, 2, BINS), np.complex128)
         self._left: float | None = None  # part of the left ear in the last frame
         self._margin = 0.0  # degrees, in favour of the left ear
         self._sum = np.zeros(SIZE)  # of the overlapping frames
@@ -431,7 +431,7 @@ class _Source:
         if id_ in azimuths:
             self._silent = 0
             mask = masks.of(frame)[id_]
-            self._covariance += mask[:, np.newaxis, np.newaxis] * frame.covariance
+            self._covariance += mask * frame.covariance
             left = self._choose_ear(id_, azimuths)
             found = spatial_filter.separate(frame.spectrum, self._covariance, frame.total, left)
             self._sum += spatial_filter.overlap(found * mask)
