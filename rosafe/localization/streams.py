@@ -234,7 +234,7 @@ class SourceStreams:
         else:
             azimuth = newest.places[id_]
             first = source.end if source else -(self._begin(0) // HOP)  # at the earliest, that with the first sample
-            frames = [frame.with_source(id_, azimuth) for frame in self._frames if frame.number >= first]
+            frames = [frame.with_source(id_, azimuth, newest.yaw) for frame in self._frames if frame.number >= first]
             if not frames:
                 return []
             if source is None:
@@ -289,7 +289,7 @@ class _State(NamedTuple):
 
 
 _NEVER = _Place(0.0, 0.0, -math.inf)
-_NONE = _State(-math.inf, {}, 0.0, 0.0)
+_NONE = _State(-math.inf, {}, math.nan, 0.0)
 
 
 class _Rows(NamedTuple):
@@ -310,7 +310,7 @@ class _Frame(NamedTuple):
         The part of the frame in the mean over the past, and this mean.
     rows : _Rows
     yaw : float
-        Direction of the head, degrees.
+        Direction of the head, degrees; NaN if there are no tracks of this time.
     places : mapping
         The azimuths of the sources in the world, by id.
     """
@@ -323,9 +323,11 @@ class _Frame(NamedTuple):
     yaw: float
     places: Mapping[int, float]
 
-    def with_source(self, id_: int, azimuth: float) -> _Frame:
-        """Return the frame with the azimuth of another source."""
-        return self if id_ in self.places else self._replace(places={**self.places, id_: azimuth})
+    def with_source(self, id_: int, azimuth: float, yaw: float) -> _Frame:
+        """Return the frame with the azimuth of another source, and with a direction of the head if it has none."""
+        if id_ in self.places:
+            return self
+        return self._replace(places={**self.places, id_: azimuth}, yaw=self.yaw if math.isfinite(self.yaw) else yaw)
 
     def turned(self) -> dict[int, float]:
         """Return the azimuths relative to the head."""
