@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from pathlib import Path
 
@@ -102,25 +103,29 @@ def test_samples_do_not_depend_on_blocks(kemar: Head, model: DirectionModel) -> 
 
 
 def test_a_source_has_no_gaps_and_no_clicks_and_keeps_its_numbers_after_a_pause(sphere_model: Path) -> None:
-    tone = 0.1 * np.sin(2 * np.pi * 500 * np.arange(3 * RATE) / RATE)
+    tone = 0.1 * np.sin(2 * np.pi * 500 * np.arange(4 * RATE) / RATE)
     ears = Head.sphere().render(tone, RATE, 40.0)
     streams = SourceStreams(DirectionModel.load(sphere_model), detect_speech=False)
-    streams.update(0.3, [track(1, 40.0)])
-    streams.update(0.6, [track(1, 40.0, log_odds=-1.0)])  # held until the next update
-    streams.update(0.95, [track(1, 40.0, log_odds=-1.0)])
-    streams.update(1.6, [track(1, -40.0)])  # of the other ear
-    streams.update(2.2, [])
+    streams.update(0.9, [track(1, 40.0)])
+    streams.update(1.2, [track(1, 40.0, log_odds=-1.0)])  # held until the next update
+    streams.update(1.55, [track(1, 40.0, log_odds=-1.0)])
+    streams.update(2.6, [track(1, -40.0)])  # of the other ear
+    streams.update(3.2, [])
     parts = separate(streams, ears)[1]
+    assert len(parts[0].samples) > 0.55 * RATE, "the sound before the source was found"
     starts = [
-        number for number, part in enumerate(parts[1:], 1) if part.first_sample != parts[number - 1].first_sample + 320
+        number
+        for number, (before, part) in enumerate(itertools.pairwise(parts), 1)
+        if part.first_sample != before.first_sample + len(before.samples)
     ]
     assert len(starts) == 1, "one pause"
     after = parts[starts[0]]
     assert after.first_sample - parts[0].first_sample == round((after.time - parts[0].time) * RATE)
     sound = aligned(parts, ears.shape[1])
     heard = scipy.signal.lfilter(np.ones(160) / 160, 1.0, sound**2) > 1e-5
-    assert not heard[: round(0.36 * RATE)].any() and heard[round(0.45 * RATE) : round(0.95 * RATE)].all()
-    assert not heard[round(1.12 * RATE) : round(1.65 * RATE)].any() and not heard[round(2.4 * RATE) :].any()
+    assert not heard[: round(0.38 * RATE)].any() and heard[round(0.45 * RATE) : round(1.63 * RATE)].all()
+    assert not heard[round(1.7 * RATE) : round(2.08 * RATE)].any() and not heard[round(3.4 * RATE) :].any()
+    assert heard[round(2.15 * RATE) : round(3.25 * RATE)].all()
     # a click would have energy far from the tone
     rest = scipy.signal.sosfilt(scipy.signal.butter(6, 2000, "high", fs=RATE, output="sos"), sound)
     assert np.abs(rest).max() < 0.002

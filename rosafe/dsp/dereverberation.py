@@ -1,0 +1,66 @@
+"""Dereverberation of two ears while the sound arrives: the late sound is predicted from the past and subtracted.
+
+T. Yoshioka and T. Nakatani (2012), "Generalization of multi-channel linear prediction methods for blind MIMO impulse
+response shortening", IEEE Trans. Audio Speech Lang. Process. 20, 2707-2720, with recursive least squares (A. Jukić,
+T. van Waterschoot and S. Doclo, 2017, "Adaptive speech dereverberation using constrained sparse multichannel linear
+prediction", IEEE Signal Process. Lett. 24, 101-105). The prediction is linear and equal for all sources, so that
+interaural differences of the direct sound remain.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rosafe.dsp.copies import OwnState
+from rosafe.dsp.gammatone_synthesis import ComplexArray
+from rosafe.dsp.numeric_limits import FloatArray
+
+_DELAY = 2  # frames from the sound that is predicted back to the newest one that predicts it
+_TAPS = 4  # frames that predict it
+_KEPT = 0.997  # weight of the past, for each frame
+_START = (
+    0.005  # of the inverse covariance, at first and at most: less learns more slowly, and distorts a first word less
+)
+_MAX_LATE = 0.5  # amplitude that is subtracted, at most, relative to that of the sound: tones are predicted, too
+_SILENCE = 1e-9  # power of a frame and bin of sound with full scale 1, below which nothing is learned
+
+
+class Dereverberator(OwnState):
+    """Subtracts late reverberation from successive Fourier transforms of both ears.
+
+    Parameters
+    ----------
+    bins : int
+        Number of frequencies, K.
+    """
+
+    def __init__(self, bins: int) -> None:
+        size = 2 * _TAPS
+        self._past = np.zeros((bins, _DELAY + _TAPS, 2), np.complex128)  # the newest frame first
+        self._prediction = np.zeros((bins, 2, size), np.complex128)
+        self._inverse = np.tile(
+            _START * np.eye(size, dtype=np.complex128), (bins, 1, 1)
+        )  # of the covariance of the past
+
+    def process(self, spectrum: ComplexArray) -> ComplexArray:
+        """Return the next frame (2, K) without late reverberation."""
+        self._past = np.concatenate((spectrum.T[:, np.newaxis], self._past[:, :-1]), axis=1)
+        past = self._past[:, _DELAY:].reshape(len(self._past), -1, 1)
+        late = self._prediction @ past
+        early = spectrum.T[..., np.newaxis] - late
+        power = np.mean(np.abs(self._past[:, :_DELAY]) ** 2, axis=(1, 2))[:, np.newaxis, np.newaxis] + _SILENCE
+        projected = self._inverse @ past
+        energy = np.maximum(np.sum(past.conj() * projected, axis=1, keepdims=True).real, 0.0)
+        gain = projected / (_KEPT * power + energy)
+        self._prediction += early * gain.conj().transpose(0, 2, 1)
+        self._inverse -= gain * projected.conj().transpose(0, 2, 1)
+        # without sound, or with a tone only, it would grow without a limit
+        size = np.einsum("kii->k", self._inverse).real / self._inverse.shape[1]
+        self._inverse *= (1 / np.maximum(size / _START, _KEPT))[:, np.newaxis, np.newaxis]
+        part = _amplitude(late[..., 0].T) / np.maximum(_MAX_LATE * _amplitude(spectrum), 1e-150)
+        return np.asarray(spectrum - late[..., 0].T / np.maximum(part, 1.0))
+
+
+def _amplitude(spectrum: ComplexArray) -> FloatArray:
+    """Return the amplitude (K,) of both ears together."""
+    return np.asarray(np.sqrt((np.abs(spectrum) ** 2).sum(axis=0)))
