@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import math
 import os
 import tempfile
 import threading
@@ -25,6 +26,7 @@ from rosafe.tree.setups import AcquireSettings, Setup, SetupProcessor, write
 if TYPE_CHECKING:
     import numpy as np
 
+    from rosafe.audio.devices import SoundSource
     from rosafe.commands._launcher import Launcher
     from rosafe.ros import Frames
     from rosafe.ros1.client.component_client import ComponentClient
@@ -153,14 +155,15 @@ class Demo:
         is_file = os.path.exists(path) or (":" not in sound and ("/" in sound or "." in sound))
         self.device = f"file:{path}" if is_file and sound else sound
         self.seconds = seconds
-        self.sample_rate, self.source = DEFAULT_RATE, None
+        self.sample_rate = DEFAULT_RATE
+        self.source: SoundSource | None = None
         if self.device.startswith(("file:", "scene:")):
             self.source = source = open_source(self.device, 0, 1, threading.Event())
             source.close()
             self.sample_rate = source.sample_rate
-            if source.frames is not None and source.frames < source.sample_rate:
-                seconds = source.frames / source.sample_rate
-                raise CommandError(f"{sound}: expected at least 1 s of sound, got {seconds:.3g} s")
+            length = (getattr(source, "frames", None) or math.inf) / self.sample_rate
+            if length < 1:
+                raise CommandError(f"{sound}: expected at least 1 s of sound, got {length:.3g} s")
         self.sound = AcquireSettings.of({"device": self.device, "sampleRate": self.sample_rate})
         self.ports: dict[str, Port] = {}
         self.parameters: Mapping[str, Any] = {}
@@ -169,7 +172,10 @@ class Demo:
     def setup(self) -> Setup:
         """The tree of the user guide; blocks last 0.1 s."""
         highest = min(8000.0, 0.45 * self.sample_rate)
-        explicit = {"input": {"nFramesPerBlock": self.sample_rate // 10}, "gammatone": {"fb_highFreqHz": highest}}
+        explicit: dict[str, dict[str, Any]] = {
+            "input": {"nFramesPerBlock": self.sample_rate // 10},
+            "gammatone": {"fb_highFreqHz": highest},
+        }
         processors = (
             SetupProcessor(
                 kind.name,
