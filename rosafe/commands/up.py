@@ -116,26 +116,17 @@ class _Session:
         self._setup = setup
         self._launcher = launcher
         self._screen = _Screen(sys.stdout.isatty())
-        self._end = asyncio.Event()
 
     async def run(self) -> None:
         """Run until a signal is received."""
-        from rosafe.ros1.component import startup
+        from rosafe.commands._launcher import until_signal
 
-        loop = asyncio.get_running_loop()
-        for number in startup.ending_signals():
-            loop.add_signal_handler(number, self._end.set)
-        work = asyncio.create_task(self._work())
-        end = asyncio.create_task(self._end.wait())
         show = asyncio.create_task(self._show())
         try:
-            await asyncio.wait({work, end}, return_when=asyncio.FIRST_COMPLETED)
-            if work.done():
-                work.result()  # raises the exception of a failure
+            await until_signal(self._work())
         finally:
-            for task in (work, end, show):
-                task.cancel()
-            await asyncio.gather(work, end, show, return_exceptions=True)
+            show.cancel()
+            await asyncio.gather(show, return_exceptions=True)
             self._screen.show(self._launcher.lines())
 
     async def _show(self) -> None:

@@ -41,7 +41,7 @@ def marked_processes(mark: str) -> dict[int, str]:
     return found
 
 
-class Demo(Process):
+class RunningDemo(Process):
     """A running demonstration; a variable in its environment identifies its children."""
 
     def __init__(self, *arguments: str | Path, cwd: Path, script: Path = SCRIPTS / "demo", **env: str) -> None:
@@ -49,7 +49,7 @@ class Demo(Process):
         base = {k: v for k, v in os.environ.items() if not k.startswith("ROS_") and k != "DISPLAY"}
         super().__init__([str(script), *map(str, arguments)], {**base, **env, self.mark: "1"}, cwd)
 
-    def __enter__(self) -> Demo:
+    def __enter__(self) -> RunningDemo:
         return self
 
     def processes(self) -> dict[int, str]:
@@ -109,19 +109,16 @@ def check_walk(text: str) -> None:
 
     The recorded sound may be some blocks longer, in which the source moves back.
     """
-    check_table(text, 44100, 12000, 10.0)
+    check_table(text, 44100, 4410, 10.0)
     azimuths = np.array([line for line in path(text) if line[0] <= 10])
     assert len(azimuths) >= 9  # one a second if the recording is longer than 10.5 s, otherwise two
     _, estimate, truth = azimuths.T
     assert estimate[0] > 65 and estimate[-1] < -65
     assert (np.diff(estimate) < 5).all() and np.abs(estimate - truth).max() < 8
-    last = r"at [\d.]+ s: the talker is (.*), estimate (.*) \(confidence [01]\.\d\d\), error (\d+) deg"
+    last = r"at [\d.]+ s: estimate (.*) \(confidence [01]\.\d\d\), the source is (.*), error (\d+) deg"
     found = re.fullmatch(last, text.splitlines()[-1])
     assert found is not None, text
-    assert azimuth(found[2]) < -50 and float(found[3]) < 10
+    assert azimuth(found[1]) < -50 and float(found[3]) < 10
     assert abs(abs(azimuth(found[1]) - azimuth(found[2])) - float(found[3])) <= 1  # all three are rounded
     errors = re.search(r"^RMS error ([\d.]+) deg, largest (\d+) deg$", text, re.M)
     assert errors is not None and float(errors[1]) < 4
-    commands = re.findall(r"^\$ rosservice call (\S+) \"(.*)\"$", text, re.M)
-    assert [service for service, _ in commands[:3]] == ["/rosAFE/connect_port", "/bass/Acquire", "/rosAFE/InputProc"]
-    assert commands[0][1] == "{local: Audio, remote: bass/Audio}"

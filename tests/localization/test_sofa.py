@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,8 @@ import rosafe
 from rosafe.commands.__main__ import main
 from rosafe.localization import angles, settings, training
 from rosafe.localization.horizontal_plane import near_ear_gain
+from rosafe.localization.scene import SceneRenderer
+from rosafe.localization.scene_file import SceneError, read_scene
 from rosafe.localization.sofa import read_sofa
 from tests.harness import shared
 
@@ -157,6 +160,31 @@ def test_a_head_of_the_front_half(tmp_path: Path, plain: rosafe.Head) -> None:
     scene = tmp_path / "scene.yaml"
     scene.write_text(f"head: {path.name}\nsources: [{{signal: noise, azimuth: 110}}]\n")
     assert main(["record", str(tmp_path / "a.wav"), "--device", f"scene:{scene}", "-q", "--seconds", "0.1"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "problem"),
+    [
+        ("[[0, 80], [5, 20]]", ""),
+        ("[[0, 90], [1.5, 0], [3, -90]]", ""),
+        ("[[0, 450], [1.5, 360], [3, 270]]", ""),
+        ("120", "azimuth: expected -90 to 90 degrees, which .*got 120"),
+        ("[[0, 90], [5, -90]]", "a: expected directions in front of the head, got a course behind it"),
+    ],
+)
+def test_scenes_with_a_front_half(tmp_path: Path, azimuth: str, problem: str) -> None:
+    """Also with labels that the scene corrects, and with noise from the front half."""
+    lab = Laboratory(np.arange(-90, 91, 5.0))
+    _right_ear_first(lab)
+    lab.write(tmp_path / "front.sofa")
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(
+        "head: {file: front.sofa, mirror: true}\nnoise: {snr_db: 20}\n"
+        f"sources:\n  - {{name: a, signal: noise, azimuth: {azimuth}}}\n"
+    )
+    with pytest.raises(SceneError, match=problem) if problem else contextlib.nullcontext():
+        samples = SceneRenderer(read_scene(scene)).frames(44100)
+        assert np.std(samples[0]) > 1.2 * np.std(samples[1])
 
 
 def test_the_model_of_a_front_half_is_equal_front_and_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -338,7 +366,7 @@ def test_the_option_of_head_learn(
     option: tuple[str, ...],
     corrected: bool,
 ) -> None:
-    monkeypatch.setattr(training, "SOUND_SECONDS", 10.0)
+    monkeypatch.setattr(training, "SOUND_SECONDS", 30.0)
     lab = Laboratory(np.arange(0, 360, 15.0), 16000.0)
     lab.responses[:, 1] *= 1.1  # not symmetric
     path = lab.write(tmp_path / "right.sofa")

@@ -15,9 +15,7 @@ import pytest
 from rosafe.tree import history, parameter_updates, processor, tree, workers
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
-from rosafe.tree.states import State, StateMachine
 from rosafe.tree.tree import Tree
-from rosafe.tree.workers import Workers
 
 from .explorer import Scheduler, explore
 from .support import Plain, use_plain_stages
@@ -328,9 +326,6 @@ class Failing(Plain):
         return block
 
 
-# --- correct code ---
-
-
 @pytest.fixture(autouse=True)
 def plain_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     use_plain_stages(monkeypatch, preProc=Failing)
@@ -376,105 +371,3 @@ def test_any_order_of_events_with_few_wake_ups(scenario: Scenario, monkeypatch: 
     for name in ("WAKE_THRESHOLD_SECONDS", "BUSY_THRESHOLD_SECONDS"):
         monkeypatch.setattr(workers, name, math.inf)
     assert go(monkeypatch, scenario, 2, 1, WALKS) > WALKS + 15
-
-
-# --- faults that must be found ---
-
-
-def test_the_exploration_finds_a_parent_that_does_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The parent releases a block while a child holds the last block, or has not read it yet."""
-    finish_block = StateMachine.finish_block
-
-    def release_anyway(self: StateMachine, computed: Block | None) -> None:
-        self._readers.clear()
-        finish_block(self, computed)
-
-    monkeypatch.setattr(StateMachine, "finish_block", release_anyway)
-    with pytest.raises(AssertionError, match="released"):
-        go(monkeypatch, grow, 2, 1, WALKS)
-
-
-def test_the_exploration_finds_an_outdated_check_for_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A child checks for a token and takes it later, when there may be another one."""
-
-    def take_later(self: Processor) -> bool:
-        if not self.ready:
-            return False
-        self.busy = True
-        self.current_block = self._next_block
-        self._context.workers.lock.release()
-        self._context.workers.lock.acquire()
-        self.input_pending, self._next_block, self._block_owner = False, None, self.parent
-        if self.current_block is not None:
-            self._set_state(State.EXEC, self.current_block.number)
-        return True
-
-    monkeypatch.setattr(Processor, "begin_work", take_later)
-    with pytest.raises(AssertionError, match=r"released|deadlock"):
-        go(monkeypatch, replace_input, 2, 2, WALKS)
-
-
-def test_the_exploration_finds_a_token_returned_to_the_wrong_parent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A child returns its block to its present parent, not to the owner of the block."""
-
-    def return_to_the_present_parent(self: StateMachine) -> None:
-        if self.parent is not None:
-            self.parent._reader_done(self)
-
-    monkeypatch.setattr(StateMachine, "release_input", return_to_the_present_parent)
-    with pytest.raises(AssertionError, match="released"):
-        go(monkeypatch, replace_input, 2, 0, WALKS)
-
-
-def test_the_exploration_finds_a_deadlock(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A child does not report that it is finished with a block."""
-    monkeypatch.setattr(StateMachine, "_reader_done", lambda self, child: self._readers.discard(child))
-    with pytest.raises(AssertionError, match="deadlock"):
-        go(monkeypatch, grow, 2, 0, WALKS)
-
-
-def test_the_exploration_finds_a_task_with_two_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An input is notified twice, and run by two workers."""
-    begin = StateMachine.begin_work
-
-    def begin_while_busy(self: StateMachine) -> bool:
-        self.busy = False
-        return begin(self)
-
-    monkeypatch.setattr(StateMachine, "begin_work", begin_while_busy)
-    with pytest.raises(AssertionError):
-        go(monkeypatch, wake, 2, 1, WALKS)
-
-
-def test_the_exploration_finds_a_lost_notification(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An input has read no block, and loses a notification that arrived meanwhile."""
-    end_work = Processor.end_work
-
-    def forget(self: Processor) -> None:
-        self.input_pending = self.input_pending and self.state is not State.WAIT_EXEC
-        end_work(self)
-
-    monkeypatch.setattr(Processor, "end_work", forget)
-    with pytest.raises(AssertionError, match="deadlock"):
-        go(monkeypatch, wake, 2, 1, WALKS)
-
-
-def test_the_exploration_finds_a_worker_that_is_not_woken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Workers, "wake", lambda self: None)
-    with pytest.raises(AssertionError, match="deadlock"):
-        go(monkeypatch, wake, 2, 1, WALKS)
-
-
-def test_the_exploration_finds_a_slot_that_is_not_returned(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The thread of the source keeps its slot after its tasks."""
-    release = Workers._release_slot
-
-    def keep(self: Workers, me: Any) -> None:
-        if me is not self._caller:
-            release(self, me)
-
-    monkeypatch.setattr(Workers, "_release_slot", keep)
-    monkeypatch.setattr(Workers, "_check_sources", lambda self: None)  # they would never end
-    monkeypatch.setattr(workers, "SHORT_RUN_SECONDS", 0.0)
-    with pytest.raises(AssertionError, match="deadlock"):
-        go(monkeypatch, receive, 1, 1, WALKS)

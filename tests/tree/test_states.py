@@ -320,36 +320,3 @@ def test_each_processor_may_fail() -> None:
     """A failed processor ends immediately, and its children end after their last block."""
     explore(World(CHILD, 2, fails=True))
     explore(World(GRANDCHILD, 1, called_once=True, fails=True))
-
-
-def test_a_notification_lost_during_publishing_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    begin = StateMachine.begin_work
-
-    def forget(self: StateMachine) -> bool:
-        begun = begin(self)
-        self.input_pending = False
-        return begun
-
-    monkeypatch.setattr(StateMachine, "begin_work", forget)
-    with pytest.raises(AssertionError, match="waits forever"):
-        explore(World(CHILD, 3, called_once=True))
-
-
-@pytest.mark.parametrize(
-    ("name", "mutant", "fault"),
-    [
-        ("_reader_done", lambda self, child: self._readers.discard(child), "waits forever"),
-        (
-            "release_input",
-            lambda self: self.parent and self.parent._reader_done(self),
-            "changed under its reader|waits forever|saw",
-        ),
-        ("_end_if_exhausted", lambda self: None, "waits forever"),
-        ("_detach", lambda self: self.parent and self.parent.children.remove(self), "waits forever|changed|assert"),
-    ],
-)
-def test_faults_are_found(name: str, mutant: Any, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(StateMachine, name, mutant)
-    with pytest.raises(AssertionError, match=fault):
-        for parents in (CHILD, ANOTHER_INPUT):
-            explore(World(parents, 2))

@@ -60,6 +60,7 @@ class FileSource(PacedSource):
                 self._pick(options["channels"])
             self._check(sample_rate, begin)
             self.remarks += filter(None, [self._file.remark])
+            self.frames = None if options.get("loop") else self._file.frames - begin  # None without an end
             pieces = self._play(begin, frames_per_chunk, options.get("loop", 0))
             self._start(self._file.sample_rate, frames_per_chunk, pieces)
         except BaseException:

@@ -1,57 +1,22 @@
-"""Results as text: the table of ports, the path of the source, levels. ASCII only, for any terminal."""
+"""Results as text: the table of ports and the path of the source. ASCII only, for any terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 RULER = 41  # characters from 90 degrees left to 90 degrees right; odd, so that one of them is 0 degrees
-SILENCE_DB = -120.0
 
 
-@dataclass(frozen=True)
-class PortRow:
-    """The messages received from one port.
-
-    Attributes
-    ----------
-    topic, type : str
-        Names on the ROS graph.
-    message_rate : float
-        Messages per second as they arrived; NaN for fewer than two.
-    frames : int
-        Frames received.
-    frame_rate : int
-        Frames per second, from the metadata of the messages.
-    lost : int
-        Frames missing between the received ones.
-    """
-
-    topic: str
-    type: str
-    message_rate: float
-    frames: int
-    frame_rate: int
-    lost: int
-
-
-def port_table(rows: Sequence[PortRow]) -> str:
-    """Return the table of ports, one line for each."""
-    head = ("port", "type", "msg/s", "frames", "frames/s", "lost")
-    cells = [
-        (row.topic, row.type, f"{row.message_rate:.2f}", str(row.frames), str(row.frame_rate), str(row.lost))
-        for row in rows
-    ]
-    widths = [max(len(line[column]) for line in (head, *cells)) for column in range(len(head))]
-    return "\n".join(
-        "  ".join(
-            text.ljust(width) if column < 2 else text.rjust(width)
-            for column, (text, width) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in (head, tuple("-" * width for width in widths), *cells)
-    )
+def port_table(rows: Sequence[tuple[str, str, float, int, int, int]]) -> str:
+    """Return the table of ports, with topic, type, messages/s, frames, frames/s and lost frames of each."""
+    cells: list[tuple[str, ...]] = [("port", "type", "msg/s", "frames", "frames/s", "lost")]
+    cells += [(topic, kind, f"{pace:.2f}", *map(str, counts)) for topic, kind, pace, *counts in rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    cells.insert(1, tuple("-" * width for width in widths))
+    form = "  ".join(f"{{:{'<' if column < 2 else '>'}{width}}}" for column, width in enumerate(widths))
+    return "\n".join(form.format(*line) for line in cells)
 
 
 def side(azimuth: float) -> str:
@@ -100,9 +65,3 @@ def path_table(times: np.ndarray, series: Mapping[str, np.ndarray], every: float
 def _median(values: np.ndarray) -> float:
     valid = values[np.isfinite(values)]
     return float(np.median(valid)) if len(valid) else float("nan")
-
-
-def level_db(samples: np.ndarray) -> float:
-    """Return the level (dB) of samples with full scale 1.0; at least `SILENCE_DB`."""
-    power = float(np.mean(np.square(samples))) if len(samples) else 0.0
-    return max(SILENCE_DB, 10 * np.log10(power)) if power > 0 else SILENCE_DB
