@@ -39,6 +39,11 @@ def lateral(azimuths: Any) -> FloatArray:
     return np.where(np.abs(wrapped) > 90.0, np.sign(wrapped) * 180.0 - wrapped, wrapped)
 
 
+def in_front(azimuths: Any) -> Any:
+    """Return whether azimuths are at most 90 degrees from straight ahead."""
+    return np.abs(wrap(azimuths)) <= 90.0
+
+
 def unwrap(azimuths: FloatArray) -> FloatArray:
     """Return azimuths (degrees) without jumps: each differs from the one before by the shorter way round."""
     steps = difference(azimuths[1:], azimuths[:-1])

@@ -49,6 +49,7 @@ _SMOOTHING = 0.75  # bins, along ITD and ILD
 _CLASS_SMOOTHING = 0.5  # classes
 # Weights of ITD and ILD in the first coherence classes and in the others, at `_WEIGHT_HZ`. They maximize the posterior
 # of the right direction in 2,000 windows of 0.5 and 1 s: training sounds of KEMAR, with and without rooms, not counted.
+# They are for sums over many units of one source. Each unit alone has them with the exponent `UNIT_WEIGHT`.
 _COHERENT = 2  # classes
 _WEIGHT_HZ = np.array([80, 198, 361, 587, 899, 1330, 1926, 2750, 3890, 5464, 7641])
 _WEIGHTS = np.array(
@@ -59,6 +60,7 @@ _WEIGHTS = np.array(
          [0.12, 0.12, 0.09, 0.06, 0.05, 0.05, 0.03, 0.03, 0.09, 0.17, 0.19]],
     ]
 )  # fmt: skip
+UNIT_WEIGHT = 0.15
 _PRIOR_COUNT = 10.0  # frames that the distribution over all directions counts for
 HUM_PART = 16.0  # frames of hum for each one of sound
 HUM_CLASSES = 4  # of coherence, in which hum is counted: independent noise is below
@@ -68,6 +70,8 @@ MAX_LOG_RATIO = 100.0
 
 class DirectionModel:
     """Log-likelihood ratios of cues for directions, relative to the mean over all directions.
+
+    For single units, as those of a mixture, they are relative to reverberation without its direct sound.
 
     A model does not change; copies by `copy` are the model itself, which takes tens of megabytes.
 
@@ -87,6 +91,13 @@ class DirectionModel:
         Level of a sound in dB full scale less that of the ratemap summed over ears and channels.
     itd_table, ild_table : ndarray of float32, (rows + 1, A)
         See `rosafe.localization.cues`; the last row is zero.
+
+    Parameters
+    ----------
+    description : mapping
+        The attributes above, but for the directions and tables.
+    itd_table, ild_table : ndarray, (rows + 1, A + 1)
+        The tables with a last column for reverberation.
     """
 
     def __init__(self, description: Mapping[str, Any], itd_table: np.ndarray, ild_table: np.ndarray) -> None:
@@ -98,10 +109,11 @@ class DirectionModel:
         self.max_itd = float(description["max_itd"])
         self.level_gain_db = float(description["level_gain_db"])
         # Half precision, as in files, so that a learned and a loaded model give the same numbers.
-        self.itd_table = np.asarray(itd_table, np.float16).astype(np.float32, order="C")
-        self.ild_table = np.asarray(ild_table, np.float16).astype(np.float32, order="C")
+        tables = [np.asarray(table, np.float16).astype(np.float32) for table in (itd_table, ild_table)]
+        self.itd_table, self.ild_table = (table[:, :-1].copy() for table in tables)
+        itd, ild = self._reverberation = [table[:, -1].copy() for table in tables]
         self._tables = kernels.EvidenceTables(
-            self.itd_table, self.ild_table, ITD_BINS, ILD_BINS, LEVEL_CLASSES, LEVEL_STEP
+            self.itd_table, self.ild_table, itd, ild, ITD_BINS, ILD_BINS, LEVEL_CLASSES, LEVEL_STEP
         )
 
     def __copy__(self) -> DirectionModel:
@@ -151,13 +163,31 @@ class DirectionModel:
             itd = self.itd_table[itd_row].sum(axis=0, dtype=np.float64)
             sums[channels] += factor * (itd + self.ild_table[ild_row].sum(axis=0, dtype=np.float64))
 
-    def unit_evidence(self, cues: Cues, floor: FloatArray, frames: NDArray[np.intp]) -> NDArray[np.float32]:
-        """Return `terms` (U, A) of each channel with cues of some frames (n,)."""
+    def unit_evidence(
+        self, cues: Cues, floor: FloatArray, frames: NDArray[np.intp], exponent: float = 1.0
+    ) -> NDArray[np.float32]:
+        """Return the evidence (U, A) of each channel with cues of some frames (n,), relative to reverberation.
+
+        The weights get an exponent: 0 for ratios without weights.
+        """
         valid = cues.valid[frames]
+        factors = (_weights(self.parameters["fb_cfHz"]) ** (exponent - 1)).astype(np.float32)
         if kernels.compiled():
-            return self._tables.units(cues, floor, frames, int(np.count_nonzero(valid)))
-        itd_row, ild_row = self.rows(cues.select(frames), floor)
-        return self.terms(itd_row[valid], ild_row[valid])
+            return self._tables.units(cues, floor, frames, int(np.count_nonzero(valid)), factors)
+        found = np.zeros((int(np.count_nonzero(valid)), len(self.azimuths)), np.float32)
+        tables = (self.itd_table, self.ild_table)
+        for table, late, rows, factor, bins in zip(
+            tables,
+            self._reverberation,
+            self.rows(cues.select(frames), floor),
+            factors,
+            (ITD_BINS, ILD_BINS),
+            strict=True,
+        ):
+            row = rows[valid]
+            of_row = factor.ravel()[row // (LEVEL_CLASSES * bins)]
+            found += of_row[:, np.newaxis] * (table[row] - late[row, np.newaxis])
+        return found
 
     # --- files ---
 
@@ -176,8 +206,8 @@ class DirectionModel:
             np.savez(
                 file,
                 description=np.array(json.dumps(description)),
-                itd_table=self.itd_table.astype(np.float16),
-                ild_table=self.ild_table.astype(np.float16),
+                itd_table=np.column_stack((self.itd_table, self._reverberation[0])).astype(np.float16),
+                ild_table=np.column_stack((self.ild_table, self._reverberation[1])).astype(np.float16),
             )
 
     @classmethod
@@ -200,7 +230,7 @@ class DirectionModel:
                 description = _checked_description(from_json(str(read(members["description"], ()))))
                 rows = description.pop("channels") * CLASSES
                 tables = [
-                    _checked_table(read(members[table], (rows * bins + 1, len(angles.grid()))), table)
+                    _checked_table(read(members[table], (rows * bins + 1, len(angles.grid()) + 1)), table)
                     for table, bins in (("itd_table", ITD_BINS), ("ild_table", ILD_BINS))
                 ]
             return cls(description, *tables)
@@ -267,14 +297,19 @@ class Histograms:
         self._shape = channels, COHERENCE_CLASSES, LEVEL_CLASSES
         self.itd = np.zeros((directions, *self._shape, ITD_BINS), np.float32)
         self.ild = np.zeros((directions, *self._shape, ILD_BINS), np.float32)
-        self._hum_itd = np.zeros((1, *self._shape, ITD_BINS), np.float32)
-        self._hum_ild = np.zeros((1, *self._shape, ILD_BINS), np.float32)
+        self._hum_itd, self._late_itd = np.zeros((2, 1, *self._shape, ITD_BINS), np.float32)
+        self._hum_ild, self._late_ild = np.zeros((2, 1, *self._shape, ILD_BINS), np.float32)
 
-    def add(self, direction: int, cues: Cues) -> None:
-        """Count the cues of successive frames from one direction; floors are those of windows of `WINDOW` frames."""
+    def add(self, direction: int | None, cues: Cues) -> None:
+        """Count the cues of successive frames from one direction; of reverberation if it is None.
+
+        Floors are those of windows of `WINDOW` frames.
+        """
+        late = direction is None
+        itd, ild = (self._late_itd[0], self._late_ild[0]) if late else (self.itd[direction], self.ild[direction])
         for begin in range(0, max(1, len(cues.level) - WINDOW // 2), WINDOW):
             part = cues.select(slice(begin, begin + WINDOW))
-            self._count(self.itd[direction], self.ild[direction], part, part.valid)
+            self._count(itd, ild, part, part.valid)
 
     def add_hum(self, cues: Cues) -> None:
         """Count the coherent cues of frames of mains hum: in other frames and channels, noise is louder."""
@@ -292,11 +327,16 @@ class Histograms:
         """Add to each direction d the counts of direction `source[d]` with the ears exchanged."""
         self.itd += self.itd[source][..., ::-1]
         self.ild += self.ild[source][..., ::-1]
+        self._late_itd += self._late_itd[..., ::-1]
+        self._late_ild += self._late_ild[..., ::-1]
 
     def tables(self, frequencies: FloatArray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tables of weighted log-likelihood ratios for ITD and ILD; `frequencies` (C,) in Hz."""
+        """Return the tables of `DirectionModel` for ITD and ILD; `frequencies` (C,) in Hz."""
         itd, ild = _weights(frequencies)
-        return _log_ratios(self.itd, self._hum_itd, itd), _log_ratios(self.ild, self._hum_ild, ild)
+        return (
+            _log_ratios(np.concatenate((self.itd, self._late_itd)), self._hum_itd, itd),
+            _log_ratios(np.concatenate((self.ild, self._late_ild)), self._hum_ild, ild),
+        )
 
 
 def _weights(frequencies: FloatArray) -> FloatArray:
@@ -315,13 +355,14 @@ def _unweighted(
 
 
 def _log_ratios(counts: np.ndarray, hum: np.ndarray, weights: FloatArray) -> np.ndarray:
-    """Return log(p(bin | direction) / p(bin)) of counts (A, C, K, S, bins) as (C * K * S * bins + 1, A).
+    """Return log(p(bin | direction) / p(bin)) of counts (A + 1, C, K, S, bins) as (C * K * S * bins + 1, A + 1).
 
+    The last counts are those of reverberation, which p(bin) does not contain.
     The ratio is weighted with the probability that the cues are not those of hum, which has counts (1, C, K, S, bins).
     The logarithms are multiplied by the `weights` (C, K), but not beyond what a file may contain.
     """
     smooth, hum = _smoothed(counts), _smoothed(hum)[0]
-    mean = smooth.sum(axis=0) + 1e-4
+    mean = smooth[:-1].sum(axis=0) + 1e-4
     hum = HUM_PART * hum * (mean.sum() / max(float(hum.sum()), 1.0))
     sound = mean / (mean + hum)
     mean /= mean.sum(axis=-1, keepdims=True)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 from rosafe.localization.cues import Cues, floors
-from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.direction_model import UNIT_WEIGHT, DirectionModel
+from rosafe.localization.mixture import Units
 
 
 class EvidenceWindow:
@@ -113,18 +114,23 @@ class EvidenceWindow:
         number = min(frames, self.filled)
         return (self._count - number + np.arange(number)) % self._frames
 
-    def units(self, frames: int, noise: FloatArray) -> tuple[NDArray[Any], FloatArray, NDArray[np.bool_]]:
-        """Return the evidence (U, A) of each channel with cues of the last `frames` frames, in world coordinates.
-
-        The second array (U,) contains their powers, divided by the number of frames, and the third one (U,) whether
-        their level exceeds that of `noise` (C,) in dB.
-        """
+    def units(self, frames: int, noise: FloatArray) -> Units:
+        """Return the channels with cues of the last `frames` frames, in world coordinates; `noise` (C,) is in dB."""
         places = self._last(frames)
         valid = self._cues.valid[places]
-        evidence = self._model.unit_evidence(self._cues, self._floor, places)
+        evidence = [
+            self._model.unit_evidence(self._cues, self._floor, places, exponent) for exponent in (UNIT_WEIGHT, 1.0)
+        ]
         if (yaw := self._yaw[places]).any():
-            evidence = rotate(evidence, np.broadcast_to(yaw[:, np.newaxis], valid.shape)[valid])
-        return evidence, self._powers[places][valid] / max(1, len(places)), (self._cues.level[places] > noise)[valid]
+            of_units = np.broadcast_to(yaw[:, np.newaxis], valid.shape)[valid]
+            evidence = [rotate(one, of_units) for one in evidence]
+        return Units(
+            evidence[0],
+            evidence[1],
+            np.broadcast_to(np.arange(valid.shape[1]), valid.shape)[valid],
+            self._powers[places][valid] / max(1, len(places)),
+            (self._cues.level[places] > noise)[valid],
+        )
 
 
 def rotate(evidence: NDArray[Any], yaw: FloatArray) -> NDArray[Any]:

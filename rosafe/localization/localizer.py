@@ -231,8 +231,8 @@ class Localizer(OwnState):
     def _update_tracks(self, time: float, yaw: float) -> None:
         window = self._evidence
         self.noise.update(window.level(self._update_frames))
-        evidence, powers, salient = window.units(self._track_frames, self.noise.threshold)
-        found = self.noise.remove_from(candidates(evidence, yaw, powers, salient), time, yaw)
+        found = candidates(window.units(self._track_frames, self.noise.threshold), yaw)
+        found = self.noise.remove_from(found, time, yaw)
         self._tracker.update(found, time, yaw)
 
     def _steps(self, frames: int, last_only: bool) -> list[tuple[int, int]]:

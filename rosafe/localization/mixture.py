@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rosafe.dsp import kernels
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
+from rosafe.localization.posterior import fuse
 
 SHARPNESS = 1.0  # factor of the evidence: makes the weights sparse
 ITERATIONS = 20
@@ -29,6 +30,30 @@ _LIMIT = 30.0  # of a scaled log-likelihood ratio
 _EQUAL = 1e-3  # log-likelihood ratio; directions that differ by less have equal evidence
 
 
+class Units(NamedTuple):
+    """Channels with cues of the frames of a window, of which each belongs to one source.
+
+    Attributes
+    ----------
+    evidence : ndarray of float32, (U, A)
+        Log-likelihood ratios of the directions in world coordinates.
+    weighted : ndarray of float32, (U, A)
+        The same with the weights for sums over the units of one source.
+    channels : ndarray of int, (U,)
+        The channels.
+    powers : ndarray, (U,)
+        Powers, divided by the number of frames.
+    salient : ndarray of bool, (U,)
+        Whether the level exceeds that of the noise.
+    """
+
+    evidence: NDArray[np.float32]
+    weighted: NDArray[np.float32]
+    channels: NDArray[np.intp]
+    powers: FloatArray
+    salient: NDArray[np.bool_]
+
+
 class Candidate(NamedTuple):
     """A direction that explains a share of the evidence."""
 
@@ -36,6 +61,7 @@ class Candidate(NamedTuple):
     share: float  # 0 to 1
     power: float = 0.0  # of the units that it explains, as the ratemap has it, mean over the frames
     salience: float = 1.0  # part of its evidence that is above the noise
+    odds: float = 0.0  # log-odds of the direction against its front-back image
 
 
 class Mixture(NamedTuple):
@@ -61,9 +87,9 @@ class Mixture(NamedTuple):
         return np.asarray((self.likelihood[:, few] @ self.weights[few]) * self.inverse)
 
 
-def fit(evidence: FloatArray) -> Mixture:
+def fit(evidence: NDArray[np.float32]) -> Mixture:
     """Return the mixture for the evidence (U, A) of units."""
-    likelihood = np.float32(SHARPNESS) * evidence.astype(np.float32, copy=False)
+    likelihood = np.float32(SHARPNESS) * evidence
     np.minimum(likelihood, _LIMIT, out=likelihood)  # with the next line: several times as fast as np.clip
     np.maximum(likelihood, -_LIMIT, out=likelihood)
     np.exp(likelihood, out=likelihood)
@@ -92,21 +118,16 @@ def fit_by_numpy(likelihood: NDArray[np.float32], iterations: int, weights: NDAr
     return inverse
 
 
-def candidates(
-    evidence: FloatArray,
-    yaw: float,
-    powers: FloatArray | None = None,
-    salient: NDArray[np.bool_] | None = None,
-) -> list[Candidate]:
-    """Return the directions of sources in the evidence (U, A) in world coordinates, the strongest first.
+def candidates(units: Units, yaw: float) -> list[Candidate]:
+    """Return the directions of sources in the evidence of units, the strongest first.
 
     If several directions have equal evidence, the one in front of a head with `yaw` (degrees) is returned. The power
-    of a source is the sum of the `powers` (U,) of the units that it explains, and its salience the part of these units
-    that are `salient` (U,).
+    of a source is the sum of the powers of the units that it explains, and its salience the part of these units that
+    are salient.
     """
-    if len(evidence) < MIN_UNITS:
+    if len(units.evidence) < MIN_UNITS:
         return []
-    mixture = fit(evidence)
+    mixture = fit(units.evidence)
     weight = mixture.weights
     grid = angles.grid()
     found = []
@@ -121,20 +142,40 @@ def candidates(
         close = np.array([peak - 1, peak, peak + 1]) % len(grid)
         offset = float(weight[close] @ np.array([-1.0, 0.0, 1.0]) / share[peak]) * angles.SPACING
         part = mixture.part_of(near & (weight > 0))
-        power = 0.0 if powers is None else float(part @ powers)
-        salience = 1.0 if salient is None else float(part @ salient / part.sum())
+        salience = float(part @ units.salient / part.sum())
         found.append(
             Candidate(
-                float(angles.wrap(grid[peak] + offset)), float(share[peak] / max(rest, MIN_REST)), power, salience
+                float(angles.wrap(grid[peak] + offset)),
+                float(share[peak] / max(rest, MIN_REST)),
+                float(part @ units.powers),
+                salience,
+                _front_back_odds(units, mixture, near, peak, yaw),
             )
         )
         if salience < MIN_SALIENCE:
             rest -= float(share[peak])
         weight = np.where(near, 0.0, weight)
-    return _without_images(found, evidence, yaw)
+    return _without_images(found, units.evidence, yaw)
 
 
-def _without_images(found: list[Candidate], evidence: FloatArray, yaw: float) -> list[Candidate]:
+def _front_back_odds(units: Units, mixture: Mixture, near: NDArray[np.bool_], peak: int, yaw: float) -> float:
+    """Return the log-odds of directions `near` (A,) a peak against their front-back images.
+
+    They come from the units that both explain. As in the estimate of a single direction, no channel can outvote all
+    others.
+    """
+    grid = angles.grid()
+    towards = np.flatnonzero(near & (angles.in_front(grid - yaw) == angles.in_front(grid[peak] - yaw)))
+    behind = np.array([_place(180.0 - azimuth + 2 * yaw) for azimuth in grid[towards]])
+    both = np.concatenate((towards, behind))
+    part = mixture.part_of(near | np.isin(np.arange(len(near)), behind))
+    evidence = units.weighted[:, both] * part[:, np.newaxis]
+    scores = fuse(np.stack([np.bincount(units.channels, column) for column in evidence.T], axis=1))
+    front, back = np.logaddexp.reduce(scores.reshape(2, -1), axis=1)
+    return float(front - back)
+
+
+def _without_images(found: list[Candidate], evidence: NDArray[np.float32], yaw: float) -> list[Candidate]:
     """Return the candidates; if two have equal evidence, the one in front gets the share of both."""
     kept: list[Candidate] = []
     for candidate in sorted(found, key=lambda item: abs(float(angles.difference(item.azimuth, yaw)))):
@@ -142,13 +183,17 @@ def _without_images(found: list[Candidate], evidence: FloatArray, yaw: float) ->
             if _equal(evidence, candidate.azimuth, other.azimuth):
                 share, power = other.share + candidate.share, other.power + candidate.power
                 salience = (other.share * other.salience + candidate.share * candidate.salience) / share
-                kept[index] = Candidate(other.azimuth, share, power, salience)
+                kept[index] = Candidate(other.azimuth, share, power, salience, other.odds)
                 break
         else:
             kept.append(candidate)
     return sorted(kept, key=lambda item: -item.share)
 
 
-def _equal(evidence: FloatArray, first: float, second: float) -> bool:
-    places = [round((azimuth + 175.0) / angles.SPACING) % evidence.shape[1] for azimuth in (first, second)]
-    return bool(np.abs(evidence[:, places[0]] - evidence[:, places[1]]).max() < _EQUAL)
+def _equal(evidence: NDArray[np.float32], first: float, second: float) -> bool:
+    return bool(np.abs(evidence[:, _place(first)] - evidence[:, _place(second)]).max() < _EQUAL)
+
+
+def _place(azimuth: float) -> int:
+    """Return the index of the direction of the grid that is nearest to an azimuth."""
+    return round((azimuth + 175.0) / angles.SPACING) % kernels.DIRECTIONS

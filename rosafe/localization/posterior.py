@@ -29,6 +29,17 @@ class Estimate(NamedTuple):
     posterior: FloatArray  # (A,)
 
 
+def fuse(sums: FloatArray) -> FloatArray:
+    """Return the scores (A,) of directions from the evidence (C, A) of the channels.
+
+    A channel counts by its posterior, mixed with a uniform one: no channel can outvote all others.
+    """
+    scaled = FRAME_WEIGHT * (sums - sums.max(axis=1, keepdims=True))
+    posteriors = np.exp(scaled)
+    posteriors /= posteriors.sum(axis=1, keepdims=True)
+    return np.asarray(np.log((1 - UNRELIABLE) * posteriors + UNRELIABLE / sums.shape[1]).sum(axis=0))
+
+
 class Estimator:
     """Turns scores of directions into a posterior, an azimuth and a confidence.
 
@@ -46,16 +57,6 @@ class Estimator:
         distance = np.abs(angles.difference(azimuths[:, np.newaxis], azimuths))
         self._near = distance <= TOLERANCE + 1e-9  # (A, A)
 
-    def fuse(self, sums: FloatArray) -> FloatArray:
-        """Return the scores (A,) of directions from the evidence (C, A) of the channels.
-
-        A channel counts by its posterior, mixed with a uniform one: no channel can outvote all others.
-        """
-        scaled = FRAME_WEIGHT * (sums - sums.max(axis=1, keepdims=True))
-        posteriors = np.exp(scaled)
-        posteriors /= posteriors.sum(axis=1, keepdims=True)
-        return np.asarray(np.log((1 - UNRELIABLE) * posteriors + UNRELIABLE / sums.shape[1]).sum(axis=0))
-
     def estimate(self, sums: FloatArray, units: int, yaw: float) -> Estimate:
         """Return the estimate for a window.
 
@@ -70,7 +71,7 @@ class Estimator:
         """
         if not units:
             return Estimate(np.nan, 0.0, np.full(sums.shape[1], 1 / sums.shape[1]))
-        scores = self.fuse(sums)
+        scores = fuse(sums)
         best = float(scores.max())
         posterior = np.exp(CHANNEL_WEIGHT * (scores - best))
         posterior /= posterior.sum()

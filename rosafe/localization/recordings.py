@@ -27,6 +27,7 @@ MAX_SECONDS = 60.0  # of sound that is used for a direction
 MAX_FRAMES = 2**22  # of a direction
 MIN_SECONDS = 1.0
 _REACH = 0.003  # s, of a response before and after its middle
+_LATE_SECONDS = 96.0  # of reverberation
 _MIXED = 24  # pieces of recordings from other directions that make a diffuse noise
 
 
@@ -106,8 +107,11 @@ def _check(recorded: Mapping[float, FloatArray], sample_rate: float, name: str) 
 
 def _sounds(
     recorded: Mapping[float, FloatArray], sample_rate: float, progress: Progress | None
-) -> Iterator[tuple[float, FloatArray]]:
-    """Return each recording at each signal-to-noise ratio, without a room and in one: a half of it each."""
+) -> Iterator[tuple[float | None, FloatArray]]:
+    """Return each recording at each signal-to-noise ratio, without a room and in one: a half of it each.
+
+    Then follows the reverberation of each room.
+    """
     random = np.random.default_rng(1)
     everything = list(recorded.values())
     rooms = training.room_pool(_responses(recorded, sample_rate), sample_rate, random)
@@ -117,15 +121,23 @@ def _sounds(
             sound = whole[:, :half] if index % 2 else whole[:, half:]
             count = sound.shape[1]
             if index >= len(training.SNR_DB):
-                near = sound[np.sum(sound**2, axis=1).argmax()]
-                sound = training.in_room(sound, near, rooms[random.integers(len(rooms))])
+                sound = training.in_room(sound, _louder(sound), rooms[random.integers(len(rooms))])
             noise = np.zeros((2, count))
             for _ in range(_MIXED):
                 other = everything[random.integers(len(everything))]
                 noise += np.resize(np.roll(other, -int(random.integers(other.shape[1])), axis=1).T, (count, 2)).T
             yield azimuth, sound + _normalized(noise) * 10 ** (-snr / 20)
         if progress:
-            progress((number + 1) / (len(recorded) + 1))
+            progress((number + 1) / (len(recorded) + 2))
+    count = round(max(training.MIN_LATE_SECONDS, _LATE_SECONDS / len(rooms)) * sample_rate)
+    for number, room in enumerate(rooms):
+        sound = everything[number % len(everything)]
+        yield None, training.late_sound(np.resize(_louder(sound), count), room)
+
+
+def _louder(sound: FloatArray) -> FloatArray:
+    """Return the ear with more energy."""
+    return np.asarray(sound[np.sum(sound**2, axis=1).argmax()])
 
 
 def _responses(recorded: Mapping[float, FloatArray], sample_rate: float) -> FloatArray:
@@ -149,10 +161,11 @@ def _responses(recorded: Mapping[float, FloatArray], sample_rate: float) -> Floa
 
 
 def _interpolated(table: np.ndarray, azimuths: FloatArray) -> np.ndarray:
-    """Return a table (rows, directions of `azimuths`) for the directions of the grid."""
+    """Return a table (rows, directions of `azimuths` and reverberation) for the directions of the grid."""
+    table, late = table[:, :-1], table[:, -1:]
     grid = angles.grid()
     index = np.searchsorted(azimuths, grid, side="right") - 1
     following = (index + 1) % len(azimuths)
     step = np.mod(azimuths[following] - azimuths[index], 360.0)
     part = (np.mod(grid - azimuths[index], 360.0) / np.where(step == 0, 360.0, step)).astype(np.float32)
-    return np.asarray((1 - part) * table[:, index] + part * table[:, following])
+    return np.hstack(((1 - part) * table[:, index] + part * table[:, following], late))

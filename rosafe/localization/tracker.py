@@ -25,9 +25,10 @@ _MEASUREMENT_STD = 3.0  # degrees, of a candidate
 _VELOCITY_STD = 15.0  # degrees/s, of a new track
 _ACCELERATION_STD = 8.0  # degrees/s per square root of a second
 _NEW_SHARE = 0.12  # of a candidate of a source that is not known yet; noise without a direction gives smaller peaks
-_IMAGE_SHARE = 0.28  # of a candidate at the front-back image of a source with more evidence
 _IMAGE_WIDTH = 7.5  # degrees of lateral angle between a source and its image, at most
-_IMAGE_RATIO = 0.5  # mean share of an image, at least, relative to that of the source
+_CLEAR_ODDS = 4.0  # log-odds of a candidate against its front-back image that decide
+_CLEAR_SECONDS = 2.0  # for which a decision holds
+_ODDS_RATE = 0.1  # of the mean log-odds of a track
 _BIRTH = -2.0  # log-odds of a new track
 _MAX_LOG_ODDS = 2.2
 _GAIN, _MAX_GAIN = 8.0, 1.5  # log-odds per share above the needed one, and at most
@@ -60,6 +61,8 @@ class Track:
         self.first_time = self.last_time = time
         self.state = np.array([candidate.azimuth, 0.0])
         self.share, self.power = candidate.share, candidate.power
+        self.odds = candidate.odds  # mean against the front-back image
+        self._clear_time = -math.inf
         self.log_odds = _BIRTH
         self._covariance = np.diag([_MEASUREMENT_STD**2, _VELOCITY_STD**2])
         self.history: list[tuple[float, float, float, float]] = []
@@ -99,6 +102,13 @@ class Track:
         self._covariance = self._covariance - np.outer(gain, self._covariance[0])
         self.power = candidate.power
         self.last_time = time
+        self.odds += _ODDS_RATE * (candidate.odds - self.odds)
+        if candidate.odds > _CLEAR_ODDS:
+            self._clear_time = time
+
+    def is_clear(self, time: float) -> bool:
+        """Return whether cues decided lately that this source is none of a front-back image."""
+        return time - self._clear_time <= _CLEAR_SECONDS
 
     def support(self, excess: float) -> None:
         """Raise the probability by the `excess` of the share over the needed one; lower it if that is not positive."""
@@ -114,6 +124,11 @@ class Track:
         """Whether the source has moved, both in the world and relative to the head."""
         course = np.array(self._course).reshape(-1, 2)
         return bool(len(course)) and bool(np.all(np.abs(angles.difference(course, course[-1])).max(axis=0) > _MOVED))
+
+    @property
+    def rank(self) -> tuple[bool, float, float]:
+        """The order in which tracks remain if cues do not decide clearly: known ones, odds, shares."""
+        return bool(self.id), self.odds, self.share
 
     def remember(self, time: float) -> None:
         """Add the present values to the history."""
@@ -202,23 +217,21 @@ class Tracker:
         return bool((np.abs(angles.difference(candidate.azimuth, azimuths)) >= SEPARATION).all())
 
     def _needed_share(self, track: Track, yaw: float) -> float:
-        """Return the share that raises the probability of a track: more for the front-back image of another one.
+        """Return the share that raises the probability of a track: none suffices for the front-back image of another.
 
-        Near 0 and 180 degrees, which ears hardly distinguish, only one of both remains.
+        Two tracks are images of each other if their lateral angles are equal. Both remain if the cues were clearly
+        those of one, and clearly those of the other, at different times; otherwise the one with the better cues
+        remains.
         """
-        needed = MIN_SHARE if track.id else _NEW_SHARE
         for other in self.tracks:
             laterals = angles.lateral(np.array([track.state[0], other.state[0]]) - yaw)
-            near = abs(float(angles.difference(track.state[0], other.state[0]))) < SEPARATION
-            if near or abs(float(laterals[0] - laterals[1])) >= _IMAGE_WIDTH:
+            if abs(float(laterals[0] - laterals[1])) >= _IMAGE_WIDTH or track.is_clear(self.time):
                 continue
-            lead = bool(track.id) - bool(other.id)
-            at_pole = abs(float(laterals[0])) < SEPARATION
-            if track.share < other.share * _IMAGE_RATIO ** (lead if at_pole else 1):
+            if angles.in_front(track.state[0] - yaw) == angles.in_front(other.state[0] - yaw):
+                continue
+            if other.is_clear(self.time) or track.rank < other.rank:
                 return math.inf
-            if track.share < other.share or lead < 0:
-                needed = _IMAGE_SHARE
-        return needed
+        return MIN_SHARE if track.id else _NEW_SHARE
 
     def _remember(self, time: float) -> None:
         kept = []

@@ -32,6 +32,8 @@ DRR_DB = -8.0, 10.0  # direct-to-reverberant ratio of the rooms
 STEADY_SNR_DB = 40.0
 STEADY_PART, MIN_STEADY_SECONDS = 0.1, 0.1  # of the length of another sound; at least
 SOUND_SECONDS = 1600.0  # of all directions and SNRs together
+LATE_PART = 0.06  # of this length: reverberation without its direct sound
+MIN_LATE_SECONDS = 0.5  # in each room
 NOISE_SECONDS = 12.0
 NOISE_SOURCES = 36
 _SKIP_SECONDS = 0.05  # at the beginning of a sound, until the filters have settled
@@ -71,7 +73,7 @@ def learn_head(
     length = scipy.fft.next_fast_len(round((seconds + _SKIP_SECONDS) * sample_rate), real=True)
     steady_length = max(round(STEADY_PART * length), round(MIN_STEADY_SECONDS * sample_rate))
 
-    def sounds() -> Iterator[tuple[float, FloatArray]]:
+    def sounds() -> Iterator[tuple[float | None, FloatArray]]:
         for number, azimuth in enumerate(directions):
             direct = filters.response(float(azimuth))
             for index, snr in enumerate((*SNR_DB, *ROOM_SNR_DB, STEADY_SNR_DB)):
@@ -89,7 +91,10 @@ def learn_head(
                 begin = random.integers(noise.shape[1] - count)
                 yield float(azimuth), sound[:, :count] + noise[:, begin : begin + count] * 10 ** (-snr / 20)
             if progress:
-                progress((number + 1) / (len(directions) + 1))
+                progress((number + 1) / (len(directions) + 2))
+        late_length = round(max(MIN_LATE_SECONDS, LATE_PART * SOUND_SECONDS / ROOMS) * sample_rate)
+        for number, room in enumerate(rooms):
+            yield None, late_sound(_training_sound(number, late_length, sample_rate, random), room)
 
     grid = angles.grid()
     histograms, description = count(sounds(), sample_rate, parameters, grid, head.key, cues.max_itd(head.spacing))
@@ -108,7 +113,7 @@ def learn_head(
 
 
 def count(
-    sounds: Iterable[tuple[float, FloatArray]],
+    sounds: Iterable[tuple[float | None, FloatArray]],
     sample_rate: float,
     parameters: Mapping[str, Any] | None,
     azimuths: FloatArray,
@@ -117,6 +122,7 @@ def count(
 ) -> tuple[Histograms, dict[str, Any]]:
     """Count the cues of sounds, pairs of one of `azimuths` and both ears (2, n) with a power of 1 before the head.
 
+    Reverberation without its direct sound has None instead of the azimuth.
     Returns the histograms and the description of the model.
     """
     described = cues.describe(sample_rate, parameters)
@@ -128,8 +134,11 @@ def count(
         scaled = sound * _LEVEL
         features = process(scaled, sample_rate, parameters=values, outputs=list(cues.KINDS))
         quantized = cues.quantize(features, cues.scaling_db(values), max_itd)
-        direction = int(np.abs(angles.difference(azimuths, azimuth)).argmin())
+        late = azimuth is None
+        direction = None if late else int(np.abs(angles.difference(azimuths, azimuth)).argmin())
         histograms.add(direction, quantized.select(slice(skip, None)))
+        if late:
+            continue
         powers += np.mean(scaled**2), features["ratemap"].sum(axis=(0, 1)).mean()
     for sound in hum_sounds(sample_rate):
         features = process(sound * _LEVEL, sample_rate, parameters=values, outputs=list(cues.KINDS))
@@ -164,8 +173,13 @@ def room_pool(responses: FloatArray, sample_rate: float, random: np.random.Gener
 
 def in_room(direct: FloatArray, dry: FloatArray, room: tuple[FloatArray, float]) -> FloatArray:
     """Return the direct sound (2, n) of both ears with the reverberation that a `dry` sound (n,) has in a room."""
+    return np.asarray(direct + late_sound(dry, room) * np.sqrt(room[1] * np.mean(direct**2)))
+
+
+def late_sound(dry: FloatArray, room: tuple[FloatArray, float]) -> FloatArray:
+    """Return the reverberation (2, n) of a `dry` sound (n,) in a room without the direct sound, with an RMS of 1."""
     late = scipy.signal.oaconvolve(dry[np.newaxis], room[0], axes=-1)[:, : len(dry)]
-    return np.asarray(direct + late * np.sqrt(room[1] * np.sum(direct**2) / max(float(np.sum(late**2)), 1e-300)))
+    return np.asarray(late / max(float(np.sqrt(np.mean(late**2))), 1e-150))
 
 
 def _noise_pool(

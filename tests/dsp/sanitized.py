@@ -167,13 +167,15 @@ def fuzz(cases: int) -> None:
 def evidence(rng: np.random.Generator, frames: int, channels: int) -> None:
     """Look up cues in tables of one row for each channel and class."""
     tables = [rng.random((3 * channels, kernels.DIRECTIONS)).astype(np.float32) for _ in range(2)]
-    tables_of = kernels.EvidenceTables(tables[0], tables[1], 1, 1, 3, 2.0)
+    late = [rng.random(3 * channels).astype(np.float32) for _ in range(2)]
+    tables_of = kernels.EvidenceTables(tables[0], tables[1], late[0], late[1], 1, 1, 3, 2.0)
     rows = np.tile(3 * np.arange(channels), (frames, 1))
     valid = rng.random(rows.shape) < 0.5
     cues = rows, rows.copy(), rng.uniform(-5, 10, rows.shape), valid
     sums, floor, all_frames = np.zeros((channels, kernels.DIRECTIONS)), np.zeros(channels), np.arange(frames)
     tables_of.add(sums, cues, floor, all_frames, rng.random(channels) < 0.5, -1.0)
-    tables_of.units(cues, floor, all_frames, int(valid.sum())).sum()
+    factors = rng.random((2, channels, 1)).astype(np.float32)
+    tables_of.units(cues, floor, all_frames, int(valid.sum()), factors).sum()
 
 
 def overflow() -> None:

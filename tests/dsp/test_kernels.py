@@ -544,14 +544,14 @@ def direction_model(channels: int, rng: np.random.Generator) -> DirectionModel:
     """Return a model with random tables."""
     description = {
         "sample_rate": RATE,
-        "parameters": {},
+        "parameters": {"fb_cfHz": np.linspace(100, 4000, channels)},
         "head": "",
         "is_sphere": True,
         "max_itd": 1e-3,
         "level_gain_db": 0.0,
     }
     rows = channels * cues.CLASSES
-    tables = [rng.normal(0, 1, (rows * bins + 1, kernels.DIRECTIONS)) for bins in (cues.ITD_BINS, cues.ILD_BINS)]
+    tables = [rng.normal(0, 1, (rows * bins + 1, kernels.DIRECTIONS + 1)) for bins in (cues.ITD_BINS, cues.ILD_BINS)]
     for table in tables:
         table[-1] = 0.0
     return DirectionModel(description, *tables)

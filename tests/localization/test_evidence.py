@@ -7,7 +7,7 @@ import pytest
 
 from rosafe.localization import angles
 from rosafe.localization.cues import CLASSES, ILD_BINS, ITD_BINS, LEVEL_CLASSES, Cues, floors
-from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.direction_model import DirectionModel, Histograms
 from rosafe.localization.evidence import EvidenceWindow, rotate
 
 CHANNELS, LENGTH, FRAMES = 3, 40, 170
@@ -26,13 +26,13 @@ def model() -> DirectionModel:
     rows = CHANNELS * CLASSES
     description = {
         "sample_rate": 16000,
-        "parameters": {"fb_nChannels": CHANNELS},
+        "parameters": {"fb_cfHz": np.linspace(100.0, 4000.0, CHANNELS)},
         "head": "random",
         "is_sphere": False,
         "max_itd": 1e-3,
         "level_gain_db": 0.0,
     }
-    tables = [RANDOM.standard_normal((rows * bins + 1, len(angles.grid()))) for bins in (ITD_BINS, ILD_BINS)]
+    tables = [RANDOM.standard_normal((rows * bins + 1, len(angles.grid()) + 1)) for bins in (ITD_BINS, ILD_BINS)]
     for table in tables:
         table[-1] = 0.0  # of frames without cues
     return DirectionModel(description, *tables)
@@ -66,3 +66,30 @@ def test_sums_are_those_of_the_frames_in_the_window(model: DirectionModel, block
         expected = direct_sum(model, cues.select(kept), yaw[kept])
         np.testing.assert_allclose(window.sums(), expected, atol=1e-4)  # single precision is turned
     assert np.abs(expected).max() > 10
+
+
+def test_units_are_compared_with_reverberation(model: DirectionModel) -> None:
+    """The last column of the tables, which is that of reverberation, is subtracted; both with the same weights."""
+    found, frames = random_cues(), np.arange(3)
+    floor = floors(found.level)
+    valid = found.valid[frames]
+    itd, ild = (rows[valid] for rows in model.rows(found.select(frames), floor))
+    for exponent in (1.0, 0.0):
+        terms = model.terms(itd, ild) if exponent else model.unweighted_terms(itd, ild)
+        units = model.unit_evidence(found, floor, frames, exponent)
+        late = terms - units
+        assert np.ptp(late, axis=1).max() < 1e-4 * np.abs(terms).max() and np.abs(late).mean() > 0.1
+
+
+def test_reverberation_does_not_change_the_tables_of_directions() -> None:
+    """It has another distribution: that of its own frames."""
+    histograms = Histograms(CHANNELS, 2)
+    frequencies = np.linspace(100.0, 4000.0, CHANNELS)
+    histograms.add(0, random_cues())
+    histograms.add(1, random_cues())
+    before = histograms.tables(frequencies)
+    assert all(np.abs(table[:, -1]).max() < 1e-4 for table in before)  # that of the mean
+    histograms.add(None, random_cues())
+    for table, without in zip(histograms.tables(frequencies), before, strict=True):
+        np.testing.assert_array_equal(table[:, :-1], without[:, :-1])
+        assert np.abs(table[:-1, -1]).mean() > 0.01

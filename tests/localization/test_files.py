@@ -203,14 +203,14 @@ def _inflating_model(path: Path, channels: int = 128) -> None:
                 if name == "description":
                     np.save(member, array)
                 else:
-                    header = {"descr": "<f2", "fortran_order": False, "shape": (3 * 10**7, 72)}
+                    header = {"descr": "<f2", "fortran_order": False, "shape": (3 * 10**7, 73)}
                     np.lib.format.write_array_header_1_0(member, header)
                     for _ in range(70):
                         member.write(bytes(4 * 2**20))
 
 
 def _absurd_shape(path: Path) -> None:
-    header = b"{'descr': '<f2', 'fortran_order': False, 'shape': (1000000000000, 72), }"
+    header = b"{'descr': '<f2', 'fortran_order': False, 'shape': (1000000000000, 73), }"
     with zipfile.ZipFile(path, "w") as archive:
         for name in ("description", "itd_table", "ild_table"):
             archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
@@ -292,7 +292,7 @@ def small_model(parameters: dict[str, Any], head: str = "a head") -> dict[str, n
     }
     rows = len(described["fb_cfHz"]) * cues.CLASSES
     tables = {
-        name: np.zeros((rows * bins + 1, len(angles.grid())), np.float16)
+        name: np.zeros((rows * bins + 1, len(angles.grid()) + 1), np.float16)
         for name, bins in (("itd_table", cues.ITD_BINS), ("ild_table", cues.ILD_BINS))
     }
     return {"description": np.array(json.dumps(values)), **tables}

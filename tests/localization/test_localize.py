@@ -269,7 +269,8 @@ def test_the_memory_order_of_the_tables_does_not_matter(sphere_model: Path) -> N
     """As numpy interpolates them for recordings: the kernel reads rows of contiguous memory."""
     model = DirectionModel.load(sphere_model)
     description = {**vars(model), "parameters": model.parameters}
-    other = DirectionModel(description, *(np.asfortranarray(table) for table in (model.itd_table, model.ild_table)))
+    with np.load(sphere_model) as file:
+        other = DirectionModel(description, *(np.asfortranarray(file[name]) for name in ("itd_table", "ild_table")))
     assert other.itd_table.flags.c_contiguous and other.ild_table.flags.c_contiguous
     sound = rosafe.Head.sphere().render(modulated(0.3, 2), RATE, 30)
     _equal(rosafe.localize(sound, RATE, model), rosafe.localize(sound, RATE, other))  # type: ignore[arg-type]

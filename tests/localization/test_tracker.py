@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import rosafe
-from rosafe.localization.mixture import Candidate, candidates
+from rosafe.localization.mixture import Candidate, Units, candidates
 from rosafe.localization.tracker import Tracker
 from tests.localization.conftest import RATE, modulated
 
@@ -19,22 +21,44 @@ def evidence(*azimuths: float) -> np.ndarray:
     return units
 
 
+def units(evidence: np.ndarray, powers: Any = 0.02, salient: Any = True) -> Units:
+    """Return units (U, A) of ten channels."""
+    count = len(evidence)
+    return Units(
+        evidence, evidence, np.arange(count) % 10, np.broadcast_to(powers, count), np.broadcast_to(salient, count)
+    )
+
+
 def test_equal_directions_are_one_candidate_in_front_of_the_head() -> None:
     for yaw, azimuth in ((0.0, 40.0), (180.0, 140.0)):
-        (found,) = candidates(evidence(40, 140), yaw, np.full(100, 0.02))
+        (found,) = candidates(units(evidence(40, 140)), yaw)
         assert found.azimuth == azimuth
         assert abs(found.share - 1) < 0.1 and abs(found.power - 2) < 0.1  # those of both
+        assert abs(found.odds) < 1e-6
 
 
 def test_a_candidate_has_the_power_of_its_units() -> None:
-    units = np.concatenate((evidence(40), evidence(-60), evidence(-60)))
-    powers = np.repeat([0.03, 0.01], [100, 200])
-    salient = np.repeat([True, False], [100, 200])
-    source, noise = candidates(units, 0.0, powers, salient)
+    both = np.concatenate((evidence(40), evidence(-60), evidence(-60)))
+    source, noise = candidates(
+        units(both, np.repeat([0.03, 0.01], [100, 200]), np.repeat([True, False], [100, 200])), 0
+    )
     assert (round(source.azimuth), round(noise.azimuth)) == (40, -60)
     assert abs(source.power - 3) < 0.1 and abs(noise.power - 2) < 0.1
     assert source.salience > 0.9 and noise.salience < 0.1
     assert source.share > 0.8  # of the evidence without that of the noise
+
+
+def test_a_candidate_has_odds_against_its_image() -> None:
+    """Those of all units of both, with the weights for sums; the head is turned by 30 degrees."""
+    parts = units(np.concatenate((evidence(40), evidence(-160), evidence(-160))))
+    weighted = np.where(parts.evidence > 0, 0.2, 0).astype(np.float32)  # per channel: 10 and 20 units, times 0.1
+    image, source = sorted(candidates(parts._replace(weighted=weighted), 30.0), key=lambda one: -one.azimuth)
+    assert (round(source.azimuth), round(image.azimuth)) == (-160, 40)
+    posterior = np.exp([0.2, 0.4, *[0] * 8]) / np.exp([0.2, 0.4, *[0] * 8]).sum()
+    first, second = 10 * np.log(0.7 * posterior[:2] + 0.3 / 10)
+    others = 10 * np.log(0.7 * posterior[2] + 0.3 / 10) + np.log(4)
+    expected = np.logaddexp(second, others) - np.logaddexp(first, others)
+    assert expected > 0.5 and abs(source.odds - expected) < 0.01 and abs(image.odds + expected) < 0.01
 
 
 def run(azimuths: list[list[float]], share: float = 0.5) -> Tracker:
@@ -81,22 +105,30 @@ def test_crossing_sources_keep_their_numbers() -> None:
         assert abs(track["azimuth"][-1]) > 30
 
 
-def present_at_end(shares: list[dict[float, float]]) -> list[float]:
-    """Return the azimuths of the sources that are present after updates with the shares of candidates by azimuth."""
+def present_at_end(candidates: Sequence[Mapping[float, Any]]) -> list[float]:
+    """Return the azimuths of the sources that are present after updates with candidates.
+
+    They are shares, or shares and odds, by azimuth.
+    """
     tracker = Tracker()
-    for number, now in enumerate(shares):
-        tracker.update([Candidate(azimuth, share) for azimuth, share in now.items()], 0.1 * number)
+    for number, now in enumerate(candidates):
+        found = {azimuth: one if isinstance(one, tuple) else (one, 0.0) for azimuth, one in now.items()}
+        tracker.update([Candidate(azimuth, one[0], odds=one[1]) for azimuth, one in found.items()], 0.1 * number)
     return sorted(round(track.azimuth) for track in tracker.present())
 
 
 def test_an_image_that_appears_with_its_source_is_not_a_source() -> None:
-    assert present_at_end([{30.0: 0.45, 150.0: 0.24}] * 20) == [30]
+    assert present_at_end([{30.0: (0.45, 1), 150.0: (0.5, -1)}] * 20) == [30]
     assert present_at_end([{-10.0: 0.45, -170.0: 0.4}] * 20) == [-10]
-    assert present_at_end([{-150.0: 0.6}] * 5 + [{-150.0: 0.1, -30.0: 0.6}] * 30) == [-30]  # it was the image
+    assert present_at_end([{-150.0: (0.6, -1)}] * 5 + [{-150.0: (0.4, -6), -30.0: (0.4, 6)}] * 30) == [-30]
+    assert present_at_end([{99.0: (0.5, -6), 84.0: (0.3, 6)}] * 20) == [84]
 
 
-def test_mirrored_sources_with_similar_evidence_are_both_found() -> None:
-    assert present_at_end([{30.0: 0.4, 150.0: 0.3}] * 20) == [30, 150]
+def test_mirrored_sources_are_both_found() -> None:
+    """The cues are clearly those of one, and later those of the other: less than 2 s apart."""
+    either: list[Any] = [{30.0: (0.5, 6), 150.0: (0.3, -6)}] * 8 + [{30.0: (0.3, -6), 150.0: (0.5, 6)}] * 8
+    assert present_at_end(either * 3) == [30, 150]
+    assert present_at_end(either + either[:8] * 4) == [30]  # the other one was last clear more than 2 s ago
     assert present_at_end([{80.0: 0.5, 108.0: 0.2}] * 20) == [80, 108]  # mirrored to 72: not the image of 80
 
 

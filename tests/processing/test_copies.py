@@ -80,8 +80,14 @@ def _model() -> DirectionModel:
     """Return a model with random tables."""
     described = rosafe.Stream(RATE, {"fb_nChannels": 4}, list(cues.KINDS)).describe()
     rows, random = 4 * cues.CLASSES, np.random.default_rng(4)
-    tables = [random.standard_normal((rows * bins + 1, 72)) / 4 for bins in (cues.ITD_BINS, cues.ILD_BINS)]
-    about = {"sample_rate": RATE, "parameters": described["parameters"], "head": "", "level_gain_db": 0.0}
+    tables = [random.standard_normal((rows * bins + 1, 73)) / 4 for bins in (cues.ITD_BINS, cues.ILD_BINS)]
+    about = {
+        "sample_rate": RATE,
+        "parameters": described["parameters"],
+        "head": "",
+        "max_itd": 1e-3,
+        "level_gain_db": 0.0,
+    }
     return DirectionModel({**about, "is_sphere": False}, *tables)
 
 

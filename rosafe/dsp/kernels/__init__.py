@@ -426,11 +426,14 @@ def mixture(likelihood: NDArray[np.float32], iterations: int, weights: NDArray[n
 class EvidenceTables(NamedTuple):
     """Look-up of cues, as `rosafe.localization.direction_model.DirectionModel` with its tables of `DIRECTIONS` columns.
 
-    `itd_bins`, `ild_bins` rows of the tables belong to each of `classes` of levels, which are `step` dB apart.
+    `late_itd`, `late_ild` (rows,) are those of reverberation. `itd_bins`, `ild_bins` rows of the tables belong to each of
+    `classes` of levels, which are `step` dB apart.
     """
 
     itd: NDArray[np.float32]
     ild: NDArray[np.float32]
+    late_itd: NDArray[np.float32]
+    late_ild: NDArray[np.float32]
     itd_bins: int
     ild_bins: int
     classes: int
@@ -439,8 +442,8 @@ class EvidenceTables(NamedTuple):
     def _packed(self, cues: Sequence[NDArray[Any]], floor: FloatArray) -> bytes:
         """Return the argument `cues` of kernels: see `Cues` of rosafe/localization/cues.py; the floor is (C,)."""
         itd_row, ild_row, level, valid = cues
-        arrays = map(_address, (itd_row, ild_row, level, valid, floor, self.itd, self.ild))
-        return _pack_cues(len(floor), *arrays, *self[2:5])
+        arrays = map(_address, (itd_row, ild_row, level, valid, floor, *self[:4]))
+        return _pack_cues(len(floor), *arrays, *self[4:7])
 
     def add(
         self,
@@ -463,12 +466,27 @@ class EvidenceTables(NamedTuple):
         )
 
     def units(
-        self, cues: Sequence[NDArray[Any]], floor: FloatArray, frames: NDArray[np.int64], number: int
+        self,
+        cues: Sequence[NDArray[Any]],
+        floor: FloatArray,
+        frames: NDArray[np.int64],
+        number: int,
+        factors: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Return the evidence (number, A) of each channel with cues of frames (n,)."""
+        """Return the evidence (number, A) of each channel with cues of frames (n,), relative to reverberation.
+
+        `factors` (2, C, K) are those of ITD and ILD in the classes of coherence of each channel.
+        """
         evidence = np.empty((number, DIRECTIONS), np.float32)
-        packed = self._packed(cues, floor)
-        _function("rosafe_unit_evidence")(packed, self.step, _address(frames), len(frames), _address(evidence))
+        _function("rosafe_unit_evidence")(
+            self._packed(cues, floor),
+            self.step,
+            _address(frames),
+            len(frames),
+            _address(factors),
+            factors[0].size,
+            _address(evidence),
+        )
         return evidence
 
 

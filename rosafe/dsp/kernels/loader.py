@@ -18,7 +18,7 @@ INSTRUCTIONS = {2: "SSE4.2", 3: "AVX2 and FMA", 4: "AVX-512", 8: "NEON"}  # by l
 _INTEGER, _REAL, _ARRAY, _BITS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p, ctypes.c_uint32
 _FRAMES = _CUES = ctypes.c_char_p  # `FRAMES`, packed: one argument is ten times as fast as one for each field
 FRAMES = "PqqPqPqqqqPqqqq"  # for the module struct: `framed` of framed.h; P is an address
-CUES = "qPPPPPPPqqq"  # for the module struct: `cues` of evidence.c
+CUES = "qPPPPPPPPPqqq"  # for the module struct: `cues` of evidence.c
 _ARGUMENTS = {
     "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 4, *[_ARRAY] * 2, _INTEGER, _ARRAY, _INTEGER, _ARRAY),
     "rosafe_biquads": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY, _INTEGER),
@@ -30,7 +30,7 @@ _ARGUMENTS = {
     "rosafe_concatenate": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _ARRAY, _INTEGER),
     "rosafe_mixture": (_INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_add_evidence": (_CUES, _REAL, _ARRAY, _INTEGER, _ARRAY, _REAL, _ARRAY),
-    "rosafe_unit_evidence": (_CUES, _REAL, _ARRAY, _INTEGER, _ARRAY),
+    "rosafe_unit_evidence": (_CUES, _REAL, _ARRAY, _INTEGER, _ARRAY, _INTEGER, _ARRAY),
     "rosafe_denormals_off": (),
     "rosafe_denormals_as": (_BITS,),
     "rosafe_correlations": (_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
