@@ -426,8 +426,8 @@ def mixture(likelihood: NDArray[np.float32], iterations: int, weights: NDArray[n
 class EvidenceTables(NamedTuple):
     """Look-up of cues, as `rosafe.localization.direction_model.DirectionModel` with its tables of `DIRECTIONS` columns.
 
-    `late_itd`, `late_ild` (rows,) are those of reverberation. `itd_bins`, `ild_bins` rows of the tables belong to each of
-    `classes` of levels, which are `step` dB apart.
+    `late_itd`, `late_ild` (rows,) are those of reverberation. `itd_bins`, `ild_bins` rows of the tables belong to each
+    of `classes` of levels, which are `step` dB apart.
     """
 
     itd: NDArray[np.float32]

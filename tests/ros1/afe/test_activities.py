@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from rosafe.interface import BASS, MAX_ACTIVITIES, ROSAFE, ComponentError
-from rosafe.ros1.component import activities as module
 from rosafe.ros1.component.activities import Activities, Activity
+from rosafe.tree import health
 from rosafe.tree.health import TaskStatistics
 from tests.harness import PATIENCE
 
@@ -198,7 +198,7 @@ def test_the_interface_table_names_existing_activities() -> None:
 
 def test_a_task_measures_its_cycles(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
-    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr(health, "time", SimpleNamespace(monotonic=lambda: now))
     meter = TaskStatistics("input")
     assert meter.snapshot() == {
         "cycles": 0,

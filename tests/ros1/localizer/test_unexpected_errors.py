@@ -73,6 +73,7 @@ class Fake:
             noise=namespace(azimuths=[]),
             hop=0.1,
             sources=[],
+            updated_at=0.0,
             reset=lambda keep_noise: self.fail("reset"),
             update=lambda _, times, *__, **___: self.step(
                 "update", {"time": times[-1:], "azimuths": azimuths, "posterior": [azimuths]}

@@ -136,7 +136,7 @@ def test_directions_are_shown_with_the_truth(world: World, shown: Browser) -> No
             expected = -0.9 * np.sin(np.radians(angle)), -0.9 * np.cos(np.radians(angle))  # right and downwards
             assert place == pytest.approx(expected, abs=0.06)
         shown.until("return document.querySelector('#state').textContent.includes('live · source ')")
-        shown.until(f"return {READ}.startsWith('source 7: ') && {READ}.endsWith('± 3° (0.90)')")
+        shown.until(f"return {READ}.startsWith('source 7: ') && {READ}.endsWith('± 3° (0.90), speaks')")
         found = wait_for(lambda: line_of_source(shown), what="a line of two seconds")
     rows, near = np.array(found["rows"]), np.array(found["far"]) < 40
     azimuths = found["plot"]["high"] - (rows + 0.5) / found["plot"]["h"] * 360

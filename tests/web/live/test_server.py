@@ -183,14 +183,15 @@ def test_posterior_sources_and_truth_share_a_column(world: World) -> None:
             return view, client.pieces[view["number"]]
 
     view, pieces = asyncio.run(scenario())
-    assert (len(view["azimuths"]), view["slots"], view["rows"], view["rate"]) == (72, 8, 72 + 8 * 4 + 8, 10.0)
+    assert (len(view["azimuths"]), view["slots"], view["rows"], view["rate"]) == (72, 8, 72 + 8 * 5 + 8, 10.0)
     columns = np.concatenate([piece[3] for piece in pieces], axis=1)
     columns = columns[:, np.isfinite(columns[-8])]
-    posterior, sources, truth = columns[:72], columns[72:104].reshape(8, 4, -1), columns[104:]
+    posterior, sources, truth = columns[:72], columns[72:112].reshape(8, 5, -1), columns[112:]
     assert posterior.sum(axis=0) == pytest.approx(1, abs=1e-5)
     assert np.isnan(sources[2:]).all() and np.isnan(truth[1:]).all()
     assert (sources[:2, 0].T == [7, 8]).all() and sources[0, 3] == pytest.approx(0.9)  # the most probable one first
     assert sources[1, 1] == pytest.approx(np.degrees(-2.0), abs=1e-3)
+    assert sources[0, 4] == pytest.approx(0.8) and np.isnan(sources[1, 4]).all()  # who speaks
     assert sources[0, 2] == pytest.approx(np.degrees(0.05), abs=1e-3)
     assert sources[0, 1] == pytest.approx(truth[0] + 10, abs=0.5)
     peaks = np.array(view["azimuths"])[posterior.argmax(axis=0)]
@@ -201,8 +202,8 @@ def test_posterior_sources_and_truth_share_a_column(world: World) -> None:
         times.append(end - (values.shape[1] - np.arange(values.shape[1])) / view["rate"])
         assert stride == 1 and abs(first / view["rate"] - times[-1][0]) < 0.11
     columns = np.concatenate([piece[3] for piece in pieces], axis=1)
-    known = np.isfinite(columns[104])
-    errors = np.abs(columns[104] - Scene(16000, seconds=5.0).azimuth(np.concatenate(times) + 0.05))[known]
+    known = np.isfinite(columns[112])
+    errors = np.abs(columns[112] - Scene(16000, seconds=5.0).azimuth(np.concatenate(times) + 0.05))[known]
     # On a busy machine a column may have no message of its own. The page fills it with the values of the next one.
     same = (columns[:, 1:] == columns[:, :-1]) | np.isnan(columns[:, 1:] + columns[:, :-1])
     filled = np.append(same.all(axis=0), False)[known]

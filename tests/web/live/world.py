@@ -154,8 +154,8 @@ def localizer(graph: Graph, offset: float = 0.0) -> Iterator[None]:
         truth = delayed[0]
         header = Header(stamp=truth.stamp, frame_id="head")
         azimuth = truth.azimuths[0] + np.radians(offset)
-        found = SoundSource(id=7, azimuth=azimuth, azimuth_std=0.05, probability=0.9)
-        improbable = SoundSource(id=8, azimuth=-2.0, azimuth_std=0.5, probability=0.2)
+        found = SoundSource(id=7, azimuth=azimuth, azimuth_std=0.05, probability=0.9, speech=0.8)
+        improbable = SoundSource(id=8, azimuth=-2.0, azimuth_std=0.5, probability=0.2, speech=np.nan)
         sources.publish(SoundSources(header, [improbable, found]))
         shape = np.exp(-(((GRID - azimuth + np.pi) % (2 * np.pi) - np.pi) ** 2) / 0.02)
         posterior.publish(DirectionPosterior(header, GRID, shape / shape.sum()))
