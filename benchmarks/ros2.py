@@ -29,6 +29,7 @@ from tests.ros2.network import Network, network, variables
 BLOCK, SHORT_BLOCK = 882, 220
 HOP, WINDOW = 441, 882  # of the ILD, in audio frames
 SETTLE_SECONDS = 5.0
+WARM_SECONDS = 60.0  # until the buffers of the tree have their size
 START_SECONDS = 600.0  # including the model of the head
 READER = """
 import sys, time
@@ -138,10 +139,11 @@ def latency(seconds: float) -> list[list[str]]:
 
 
 def memory(minutes: float) -> list[list[str]]:
-    """Return the resident memory after the start, and after subscribers that came and went."""
+    """Return the resident memory after a minute, and after subscribers that came and went."""
     with ros2("representations:=[ild, ratemap, crossCorrelation]") as (net, node):
         for topic in ("ild", "ratemap", "crossCorrelation"):
             read(net, f"/rosafe/{topic}").stop()
+        time.sleep(WARM_SECONDS)
         begin, end = graph.resident(node.pid), time.monotonic() + 60 * minutes
         number = 0
         while time.monotonic() < end:
@@ -149,7 +151,7 @@ def memory(minutes: float) -> list[list[str]]:
             time.sleep(1.0)
             reader.close()
             number += 1
-        return [["after the start", f"{begin:.0f}"], [f"after {number} subscribers", f"{graph.resident(node.pid):.0f}"]]
+        return [["after a minute", f"{begin:.0f}"], [f"after {number} subscribers", f"{graph.resident(node.pid):.0f}"]]
 
 
 def main() -> None:
