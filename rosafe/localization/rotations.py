@@ -110,11 +110,10 @@ class RotationBuffer:
     def add(self, child: str, parent: str, time: float, rotation: Quaternion, static: bool) -> None:
         """Add the rotation of `child` relative to `parent` at a clock time in s."""
         child, parent = child.lstrip("/"), parent.lstrip("/")
-        norm = math.sqrt(sum(min(abs(part), 1e3) ** 2 for part in rotation))
-        named = child and parent and child != parent and max(len(child), len(parent)) <= MAX_NAME
-        if not named or not abs(norm * norm - 1) < _NORM_TOLERANCE or not math.isfinite(time):
+        if not _is_valid(child, parent, time, rotation):
             self._report(f"/tf: the transform of {printable(child)[:MAX_NAME]} is not valid and ignored", "invalid")
             return
+        norm = math.hypot(*rotation)
         x, y, z, w = rotation
         with self._lock:
             frame = self._frames.get(child)
@@ -157,6 +156,13 @@ class RotationBuffer:
                 return None
             product = _times(rotation, product)
         return product
+
+
+def _is_valid(child: str, parent: str, time: float, rotation: Quaternion) -> bool:
+    """Return whether tf2 accepts a transform."""
+    named = child and parent and child != parent and max(len(child), len(parent)) <= MAX_NAME
+    square = sum(part * part for part in rotation)  # ** raises OverflowError
+    return bool(named) and abs(square - 1) < _NORM_TOLERANCE and math.isfinite(time)
 
 
 def _inverse(rotation: Quaternion) -> Quaternion:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import importlib
 import json
 import os
@@ -401,6 +402,7 @@ def _run(stop: threading.Event) -> None:
     thread.start()
     try:
         node.begin()
+        gc.freeze()  # collecting the objects of modules would stop all threads for tens of milliseconds, without result
         stop.wait()
     finally:
         stop.set()
