@@ -24,6 +24,7 @@ import soundfile
 import rosafe
 from rosafe.localization.head import Head
 from rosafe.localization.localizer import Localizer
+from rosafe.localization.rectangular_room import RectangularRoom, RoomReflections
 from rosafe.localization.speech import SPEAKS
 from rosafe.localization.streams import RATE as STREAM_RATE
 from rosafe.localization.streams import SourceStreams
@@ -44,6 +45,7 @@ VOICES = {
 SECONDS = 6.0
 LEVEL = 10 ** (-25 / 20)
 ROOM_RT60 = 0.4  # s
+DISTANCE = 1.5  # m
 
 
 # --- sounds ---
@@ -107,16 +109,18 @@ OTHERS: dict[str, Callable[[int], np.ndarray]] = {
 }
 
 
-def room_tail(head: Head, dry: np.ndarray, drr_db: float, seed: int) -> np.ndarray:
-    """Return diffuse reverberation (2, N) of a source: decaying noise from 24 directions, at a direct-to-late ratio."""
-    random = np.random.default_rng(seed)
-    length = round(ROOM_RT60 * RATE)
-    decay = 10 ** (-3 * np.arange(length) / length)
-    late = np.zeros((2, len(dry)))
-    for azimuth in range(-180, 180, 15):
-        echo = np.r_[np.zeros(round(0.004 * RATE)), random.standard_normal(length) * decay]
-        late += head.render(scipy.signal.fftconvolve(dry, echo)[: len(dry)], RATE, azimuth)
-    return late * np.sqrt(np.mean(dry**2) * 10 ** (-drr_db / 10) / np.mean(late**2))
+def reverberation(
+    head: Head, dry: list[np.ndarray], azimuths: tuple[float, ...], drr_db: float, seed: int
+) -> np.ndarray:
+    """Return reflections and tail (2, N) of sources in a room, at a direct-to-reverberant ratio of each."""
+    room = RectangularRoom.drawn(ROOM_RT60, drr_db, seed)
+    reflections = RoomReflections(room, head.filters(RATE), RATE, seed)
+    late = np.zeros((2, len(dry[0])))
+    for sound, azimuth in zip(dry, azimuths, strict=True):
+        early, gain = reflections.of_source(azimuth, DISTANCE)
+        for response in (early, gain * reflections.tail):
+            late += scipy.signal.oaconvolve(sound[np.newaxis], response, axes=1)[:, : len(sound)]
+    return late
 
 
 # --- measurement ---
@@ -170,7 +174,7 @@ def section_talkers(head: Head, voices: dict[str, np.ndarray], pairs: int) -> li
             truths = [head.render(one, RATE, azimuth) for one, azimuth in zip(dry, azimuths, strict=True)]
             mixture = sum(truths)
             if drr is not None:
-                mixture = mixture + sum(room_tail(head, one, drr, 7 + n) for n, one in enumerate(dry))
+                mixture = mixture + reverberation(head, dry, azimuths, drr, number)
             tracks = rosafe.localize(mixture, RATE, head, streams=True)["tracks"]
             values += [improvement(tracks, a, low(t), low(mixture)) for a, t in zip(azimuths, truths, strict=True)]
         found = np.array([value for value in values if value])
@@ -203,7 +207,7 @@ def section_speech(head: Head, voices: dict[str, np.ndarray]) -> list[str]:
             dry, azimuths = (talk, scaled(other(number))), ((0.0, 60.0), (60.0, 0.0))[number % 2]
             mixture = sum(head.render(one, RATE, azimuth) for one, azimuth in zip(dry, azimuths, strict=True))
             if drr is not None:
-                mixture = mixture + sum(room_tail(head, one, drr, 7 + n) for n, one in enumerate(dry))
+                mixture = mixture + reverberation(head, dry, azimuths, drr, number)
             tracks = rosafe.localize(mixture, RATE, head, streams=True)["tracks"]
             counts = half_seconds(tracks, talk, azimuths)
             total += counts
