@@ -296,10 +296,11 @@ def main() -> None:
     head = Head.from_sofa(KEMAR)
     text = (
         "# Streams of sources\n\nMeasured by benchmarks/streams_per_source.py; method: docs/resynthesis.md. Sources "
-        f"have equal levels, {SECONDS:g} s each, 44.1 kHz, KEMAR, talkers {'; '.join(voices)}. Rooms: rectangular, of random sizes, image "
-        f"sources and a tail of {ROOM_RT60:g} s, sources at {DISTANCE:g} m, by the direct-to-reverberant ratio of each "
-        "source; the direct sound is the reference. With known directions, streams show what separation alone does, "
-        "without errors of the tracker. Not in these figures: a moving source or head, noise, real rooms. "
+        f"have equal levels, {SECONDS:g} s each, 44.1 kHz, KEMAR, talkers {'; '.join(voices)}. Rooms: rectangular, of "
+        f"random sizes, image sources and a tail of {ROOM_RT60:g} s, sources at {DISTANCE:g} m, by the "
+        "direct-to-reverberant ratio of each source; the direct sound is the reference. With known directions, streams "
+        "show what separation alone does, without errors of the tracker. Not in these figures: a moving source or head, "
+        "noise, real rooms. "
         "SI-SDR in dB, mean and range; F1 of the half seconds of both sources, from the first second on.\n"
     )
     sections: dict[str, Callable[[], list[str]]] = {

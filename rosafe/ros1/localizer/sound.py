@@ -59,6 +59,8 @@ class InputSound:
             reader.open(self._arrived.set)
             with ring.lock:
                 reader.begin(max(ring.frames.oldest, reader.position - round(_BEFORE_SECONDS * self._rate)))
+        if not self._clock.wait(seconds):  # no frame is skipped: streams are those of a file
+            return None
         if self._reader.waiting:
             self._arrived.wait(seconds)
         self._arrived.clear()
@@ -66,8 +68,5 @@ class InputSound:
         if block is None:
             return None
         samples, end = block  # frames are numbered from 1
-        try:
-            time = self._clock.time(end - samples.shape[1]).ros.to_sec()
-        except LookupError:  # the first frames of rosAFE
-            return None
+        time = self._clock.time(end - samples.shape[1]).ros.to_sec()
         return SoundBlock(samples, end - samples.shape[1] - 1, time)
