@@ -56,8 +56,9 @@ class Dereverberator(OwnState):
         # without sound, or with a tone only, it would grow without a limit
         size = np.einsum("kii->k", self._inverse).real / self._inverse.shape[1]
         self._inverse *= (1 / np.maximum(size / _START, _KEPT))[:, np.newaxis, np.newaxis]
-        part = _amplitude(late[..., 0].T) / np.maximum(_MAX_LATE * _amplitude(spectrum), 1e-150)
-        return np.asarray(spectrum - late[..., 0].T / np.maximum(part, 1.0))
+        predicted = late[..., 0].T
+        part = _MAX_LATE * _amplitude(spectrum) / np.maximum(_amplitude(predicted), 1e-150)
+        return np.asarray(spectrum - np.minimum(part, 1.0) * predicted)
 
 
 def _amplitude(spectrum: ComplexArray) -> FloatArray:

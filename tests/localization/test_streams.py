@@ -221,3 +221,15 @@ def test_refused_sound(model: DirectionModel) -> None:
     for block, text in ((np.zeros(100), "two ears"), (np.full((2, 100), np.nan), "finite")):
         with pytest.raises(ValueError, match=text):
             streams.process(block)
+
+
+def test_the_sound_before_the_first_track_is_that_of_the_direction_of_the_head(
+    kemar: Head, model: DirectionModel
+) -> None:
+    truth, other = talkers(kemar, (-40.0, 40.0))
+    streams = SourceStreams(model, detect_speech=False)
+    streams.update(0.3, [track(1, 40.0), track(2, 120.0)], yaw=80.0)
+    found = aligned(separate(streams, truth + other)[1], truth.shape[1])
+    before = slice(RATE // 50, round(0.38 * RATE))
+    ratio = si_sdr(np.stack((found, found))[:, before], truth[:, before])
+    assert ratio[1] > si_sdr((truth + other)[:, before], truth[:, before])[1] + 3
