@@ -103,6 +103,56 @@ def test_streams_are_those_of_the_file(
         assert np.nanmax(speech[by_azimuth[3]]) > 0.8 > 0.5 > np.nanmedian(speech[by_azimuth[-4]])
 
 
+def test_sources_come_and_go_and_a_slow_and_a_late_subscriber(
+    graph: Graph, localizer: Localizer, take: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    """The talker stops after 3 s, and the music begins after 2.5 s."""
+    parts = take[1].copy()
+    parts[0, :, 3 * RATE :] = 0
+    parts[1, :, : round(2.5 * RATE)] = 0
+    path = tmp_path / "come.wav"
+    soundfile.write(path, parts.sum(axis=0).T, RATE, subtype="PCM_32")
+    audio_class = importlib.import_module("rosAFE.msg").SourceAudio
+    slow: list[Any] = []
+
+    def read_slowly(message: Any) -> None:
+        time.sleep(0.2)
+        slow.append(message)
+
+    with graph.collect("/localizer/streams", audio_class) as received:
+        subscriber = rospy.Subscriber("/localizer/streams", audio_class, read_slowly, queue_size=1)
+        acquire(graph, f"file:{path}")
+        wait_for(lambda: any(abs(math.degrees(m.azimuth) - MUSIC) < 10 for m in received), what="the music")
+        with graph.collect("/localizer/streams", audio_class) as late:
+            wait_for(lambda: received[-1].header.stamp.to_sec() + 1.5 < time.time(), what="the end of the streams")
+        subscriber.unregister()
+        messages = list(received)
+    talker, tune = (
+        [m.id for m in messages if abs(math.degrees(m.azimuth) - azimuth) < 10][-1] for azimuth in (TALKER, MUSIC)
+    )
+    begins = {}
+    for id_, truth, begin, end in ((talker, parts[0], 0.0, 3.0), (tune, parts[1], 2.5, SECONDS)):
+        own = [m for m in messages if m.id == id_]
+        stream = np.zeros(own[-1].first_sample + len(own[-1].samples))  # with zeros in pauses
+        for message in own:
+            stream[message.first_sample :][: len(message.samples)] = np.array(message.samples) / 2.0**15
+        ear = truth[int(id_ == tune)]
+        lag = int(scipy.signal.correlate(np.pad(ear, (0, RATE)), stream, "full").argmax()) - len(stream) + 1
+        begins[id_] = own[0].header.stamp.to_sec() - lag / RATE
+        # the first words are heard, and the stream ends soon after the source
+        assert lag / RATE < begin + 0.3 and abs((lag + len(stream)) / RATE - end) < 1.0
+        heard = slice(max(0, round(begin * RATE) - lag), round(end * RATE) - lag)
+        reference = ear[lag:][: len(stream)][heard]
+        found = stream[heard][: len(reference)]
+        assert si_sdr(np.stack((found, found)), np.stack((reference, reference)))[0] > 3
+    assert abs(begins[talker] - begins[tune]) < 2e-3, "stamps are times of the sound"
+    known = {(m.id, m.first_sample): m for m in messages}
+    assert 3 < len(slow) < len(messages) / 2
+    for message in [*slow, *late]:
+        same = known[message.id, message.first_sample]
+        assert (same.header.stamp, same.samples) == (message.header.stamp, message.samples)
+
+
 def test_sound_of_another_rate_is_not_read_and_frames_count_from_0(graph: Graph, bass: Process, tmp_path: Path) -> None:
     path = tmp_path / "numbers.wav"
     numbers = np.arange(3 * RATE) / 2.0**20  # of the samples, from 0
