@@ -62,6 +62,20 @@ def joined(messages: list[Any], id_: int) -> np.ndarray:
     return np.concatenate([message.samples for message in own])
 
 
+SLOW = """
+import time, rospy
+from rosAFE.msg import SourceAudio
+
+def read(message):
+    print(message.id, message.first_sample, sum(message.samples), flush=True)
+    time.sleep(0.2)
+
+rospy.init_node("slow")
+rospy.Subscriber("/localizer/streams", SourceAudio, read, queue_size=1)
+rospy.spin()
+"""
+
+
 @pytest.fixture
 def run(
     graph: Graph, localizer: Localizer, take: tuple[Path, np.ndarray], sphere_model: Path
@@ -113,20 +127,13 @@ def test_sources_come_and_go_and_a_slow_and_a_late_subscriber(
     path = tmp_path / "come.wav"
     soundfile.write(path, parts.sum(axis=0).T, RATE, subtype="PCM_32")
     audio_class = importlib.import_module("rosAFE.msg").SourceAudio
-    slow: list[Any] = []
-
-    def read_slowly(message: Any) -> None:
-        time.sleep(0.2)
-        slow.append(message)
-
-    with graph.collect("/localizer/streams", audio_class) as received:
-        subscriber = rospy.Subscriber("/localizer/streams", audio_class, read_slowly, queue_size=1)
+    with graph.collect("/localizer/streams", audio_class) as received, graph.start(PYTHON, "-c", SLOW) as slow:
         acquire(graph, f"file:{path}")
         wait_for(lambda: any(abs(math.degrees(m.azimuth) - MUSIC) < 10 for m in received), what="the music")
         with graph.collect("/localizer/streams", audio_class) as late:
             wait_for(lambda: received[-1].header.stamp.to_sec() + 1.5 < time.time(), what="the end of the streams")
-        subscriber.unregister()
         messages = list(received)
+        lines = [tuple(map(int, line.split())) for line in slow.out.splitlines()]
     talker, tune = (
         [m.id for m in messages if abs(math.degrees(m.azimuth) - azimuth) < 10][-1] for azimuth in (TALKER, MUSIC)
     )
@@ -147,8 +154,9 @@ def test_sources_come_and_go_and_a_slow_and_a_late_subscriber(
         assert si_sdr(np.stack((found, found)), np.stack((reference, reference)))[0] > 3
     assert abs(begins[talker] - begins[tune]) < 2e-3, "stamps are times of the sound"
     known = {(m.id, m.first_sample): m for m in messages}
-    assert 3 < len(slow) < len(messages) / 2
-    for message in [*slow, *late]:
+    assert 3 < len(lines) < len(messages) / 2 and {line[:2] for line in lines} <= known.keys()
+    assert all(sum(known[line[:2]].samples) == line[2] for line in lines)
+    for message in late:
         same = known[message.id, message.first_sample]
         assert (same.header.stamp, same.samples) == (message.header.stamp, message.samples)
 
