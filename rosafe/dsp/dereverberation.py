@@ -18,9 +18,8 @@ from rosafe.dsp.numeric_limits import FloatArray
 _DELAY = 2  # frames from the sound that is predicted back to the newest one that predicts it
 _TAPS = 4  # frames that predict it
 _KEPT = 0.997  # weight of the past, for each frame
-_START = (
-    0.005  # of the inverse covariance, at first and at most: less learns more slowly, and distorts a first word less
-)
+# Of the inverse covariance, at first and at most: a smaller value distorts first words less, and learns more slowly.
+_START = 0.005
 _MAX_LATE = 0.5  # amplitude that is subtracted, at most, relative to that of the sound: tones are predicted, too
 _SILENCE = 1e-9  # power of a frame and bin of sound with full scale 1, below which nothing is learned
 
@@ -57,8 +56,9 @@ class Dereverberator(OwnState):
         # without sound, or with a tone only, it would grow without a limit
         size = np.einsum("kii->k", self._inverse).real / self._inverse.shape[1]
         self._inverse *= (1 / np.maximum(size / _START, _KEPT))[:, np.newaxis, np.newaxis]
-        part = _amplitude(late[..., 0].T) / np.maximum(_MAX_LATE * _amplitude(spectrum), 1e-150)
-        return np.asarray(spectrum - late[..., 0].T / np.maximum(part, 1.0))
+        predicted = late[..., 0].T
+        part = _MAX_LATE * _amplitude(spectrum) / np.maximum(_amplitude(predicted), 1e-150)
+        return np.asarray(spectrum - np.minimum(part, 1.0) * predicted)
 
 
 def _amplitude(spectrum: ComplexArray) -> FloatArray:

@@ -28,7 +28,7 @@ class Turn(NamedTuple):
     rotation: Quaternion
 
 
-class _Frame:
+class CoordinateFrame:
     """A coordinate frame: its parent, and its rotations in the order of their times."""
 
     def __init__(self, parent: str, static: bool) -> None:
@@ -87,7 +87,7 @@ class RotationBuffer:
     def __init__(self, world: str, head: str, report: Callable[[str, str], object]) -> None:
         self._world, self._head, self._report = world, head, report
         self._lock = threading.Lock()
-        self._frames: dict[str, _Frame] = {}
+        self._frames: dict[str, CoordinateFrame] = {}
         self._relevant = {world, head}
 
     def clear(self) -> None:
@@ -121,7 +121,7 @@ class RotationBuffer:
                 self._report(f"/tf: more than {MAX_FRAMES} coordinate frames; the others are ignored", "number")
                 return
             if frame is None or frame.parent != parent or frame.static != static:
-                frame = self._frames[child] = _Frame(parent, static)
+                frame = self._frames[child] = CoordinateFrame(parent, static)
                 self._relevant = {*self._chain(self._world), *self._chain(self._head)}
             if not static and child not in self._relevant:
                 return

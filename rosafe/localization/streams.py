@@ -36,6 +36,7 @@ UNIT = 320  # samples of the streams that are computed together
 LAG = 0.1  # s after which tracks are used: before, those of a live localizer have not arrived yet
 HOLD = 0.3  # s that a stream continues when its source is not present any more, which can be a pause of speech
 BEFORE = 0.6  # s with which a stream begins, from before its source was found
+PAUSE = 1.0  # s of sound that is kept: a shorter pause of a source is filled when it is present again
 _MAX_FREQUENCY = 0.48 * RATE  # Hz, of a channel
 _DIFFUSE = 0.3  # weight of diffuse sound, relative to a source
 _LEAST = 1e-4  # added to likelihoods
@@ -92,7 +93,8 @@ class SourceStreams:
     -----
     The numbers depend on the sound and the tracks only, not on the length of blocks. A sample is computed when the
     sound has arrived until 30 ms after it, in units of 20 ms. Tracks are used 0.1 s after their time, and
-    move on with their velocities until then. The stream of a new source begins with the 0.6 s before. Cues are computed
+    move on with their velocities until then. The stream of a new source begins with the 0.6 s before, and a
+    pause of up to 1 s is filled when the source is present again. Cues are computed
     at 16 kHz and every 10 ms, also for a model of another sample rate or hop.
 
     Examples
@@ -131,7 +133,7 @@ class SourceStreams:
         self._waiting: deque[_Rows] = deque()  # of the next frames
         self._dereverberator = Dereverberator(BINS)
         self._total = np.zeros((2, 2, BINS), np.complex128)
-        self._frames: deque[_Frame] = deque(maxlen=round(BEFORE * RATE / HOP))
+        self._frames: deque[_Frame] = deque(maxlen=round(PAUSE * RATE / HOP))
         self._count = 0
         self._states: deque[_State] = deque()
         self._sources: dict[int, _Source] = {}
@@ -233,7 +235,8 @@ class SourceStreams:
             frames: Iterable[_Frame] = [newest]
         else:
             azimuth = newest.places[id_]
-            first = source.end if source else -(self._begin(0) // HOP)  # at the earliest, that with the first sample
+            earliest = -(self._begin(0) // HOP)  # the frame of the first sample
+            first = source.end if source else max(earliest, newest.number + 1 - round(BEFORE * RATE / HOP))
             frames = [frame.with_source(id_, azimuth, newest.yaw) for frame in self._frames if frame.number >= first]
             if not frames:
                 return []

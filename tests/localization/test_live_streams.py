@@ -15,7 +15,7 @@ import pytest
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.head import Head
 from rosafe.localization.live_streams import LiveStreams, SoundBlock
-from rosafe.localization.streams import SourcePart
+from rosafe.localization.streams import SourcePart, SourceStreams
 from tests.harness import wait_for
 from tests.localization.conftest import RATE, modulated
 from tests.localization.test_streams import track
@@ -97,7 +97,12 @@ def test_times_numbers_and_ids(session: Session, sphere_model: Path, ears: np.nd
     assert first[0][0].first_sample == 0
     for (before, _), (after, _) in itertools.pairwise(first):
         assert after.first_sample == before.first_sample + len(before.samples)
-    heard = np.concatenate([part.samples for part, _ in first])[RATE // 10 :] / 2**15
+    offline = SourceStreams(DirectionModel.load(sphere_model), detect_speech=False)
+    offline.update(-1.0, [track(1, 40.0)])
+    same = np.concatenate([part.samples for part in offline.process(np.round(ears * 2**31).astype(np.int32))])
+    live = np.concatenate([part.samples for part, _ in first])
+    assert np.array_equal(live, same[: len(live)]), "those of a file"
+    heard = live[RATE // 10 :] / 2**15
     begin = round((first[0][1] - CLOCK) * RATE) + RATE // 10
     truth = ears[0, begin : begin + len(heard)]
     assert np.sum((heard - truth) ** 2) < 0.05 * np.sum(truth**2), "the stamp of a part is that of its first sample"

@@ -27,10 +27,18 @@ class RingSound:
         Hz; sound at another rate is not read.
     time_of : callable
         Returns the clock time (s) of a frame, of which the first is 1; LookupError if it is not known.
+    is_known : callable
+        Waits for some seconds until times are known, and returns whether they are.
     """
 
-    def __init__(self, ring: AudioRing, sample_rate: float, time_of: Callable[[int], float]) -> None:
-        self._ring, self._rate, self._time_of = ring, sample_rate, time_of
+    def __init__(
+        self,
+        ring: AudioRing,
+        sample_rate: float,
+        time_of: Callable[[int], float],
+        is_known: Callable[[float], bool] = lambda _: True,
+    ) -> None:
+        self._ring, self._rate, self._time_of, self._is_known = ring, sample_rate, time_of, is_known
         self._reader: AudioReader | None = None
         self._arrived = threading.Event()
 
@@ -53,6 +61,8 @@ class RingSound:
             reader.open(self._arrived.set)
             with ring.lock:
                 reader.begin(max(ring.frames.oldest, reader.position - round(BEFORE_SECONDS * self._rate)))
+        if not self._is_known(seconds):  # no frame is skipped: streams are those of a file
+            return None
         if self._reader.waiting:
             self._arrived.wait(seconds)
         self._arrived.clear()

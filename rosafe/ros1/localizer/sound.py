@@ -25,7 +25,7 @@ class InputSound(RingSound):
     def __init__(self, topic: str, sample_rate: float, clock: FrameClock, status: Status) -> None:
         self._input = AudioInput(loss_report(status))
         self._input.connect(topic)
-        super().__init__(self._input.ring, sample_rate, lambda frame: float(clock.time(frame).ros.to_sec()))
+        super().__init__(self._input.ring, sample_rate, lambda frame: float(clock.time(frame).ros.to_sec()), clock.wait)
 
     def close(self) -> None:
         """Unsubscribe."""
