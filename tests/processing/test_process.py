@@ -24,7 +24,6 @@ from rosafe.representations.haircell import InnerHairCell
 from tests import harness
 from tests.dsp.bare import Chain, cut
 from tests.dsp.implementations import NUMPY, levels, using
-from tests.dsp.test_vectors import CASES, assert_reference, load, parameters
 from tests.tree.support import tree_threads
 
 RATE = 16000.0
@@ -44,20 +43,6 @@ def assert_same(got: dict[str, Any], wanted: dict[str, Any], tolerance: float = 
 
 
 # --- numbers ---
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_reference_vectors(name: str) -> None:
-    """Through the tree, with parameter changes."""
-    case, expected = load(name)
-    results = rosafe.process(
-        expected["signal"],
-        case["fs"],
-        parameters=parameters(case),
-        block_frames=case["chunks"],
-        modifications=case["mods"],
-    )
-    assert_reference(case, results, expected)
 
 
 def test_speech_comes_from_one_side() -> None:
