@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -14,8 +15,9 @@ import rosafe
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Output, Stage, parts_of
 from rosafe.representations import KINDS, STAGES
+from rosafe.representations.registry import CORE_KINDS
 from tests import harness
-from tests.dsp.bare import FloatArray, cut
+from tests.dsp.bare import FloatArray, cut, joined
 
 
 def kinds_of(name: str) -> list[str]:
@@ -108,28 +110,35 @@ class Chain:
             made[kind] = stage.process(data, parent.provided[stage.required_extra] if stage.required_extra else None)
         return made
 
+    def blocks(
+        self, blocks: Iterable[NDArray[Any]], changes: Iterable[Sequence[Any]] = ()
+    ) -> list[dict[str, FloatArray]]:
+        """Return `outputs` for each block, by the names of `rosafe.process`: the parts of a kind are `<kind>_<part>`.
+
+        `changes` are (block index, parameter, value), applied before that block.
+        """
+        changes, made = list(changes), []
+        for index, block in enumerate(blocks):
+            for _, name, value in (change for change in changes if change[0] == index):
+                self.modify(name, value)
+            of_stages = self.process(block)
+            pairs = [zip(part_names(kind), parts_of(of_stages[kind]), strict=True) for kind in self.outputs]
+            made.append(dict(itertools.chain(*pairs)))
+        return made
+
     def run(
         self,
         signal: NDArray[Any],
         sizes: int | Sequence[int] | None = None,
         changes: Iterable[Sequence[Any]] = (),
     ) -> dict[str, FloatArray]:
-        """Return `outputs` for a signal (..., N) in blocks of `sizes`, concatenated, by the names of `rosafe.process`.
+        """Return the concatenated outputs for a signal (..., N) in blocks of `sizes`; see `blocks`."""
+        return joined(self.blocks([signal] if sizes is None else cut(signal, sizes), changes))
 
-        `changes` are (block index, parameter, value), applied before that block; they may not alter the leading shape.
-        The parts of a kind are named `<kind>_<part>`.
-        """
-        changes = list(changes)
-        collected: dict[str, list[FloatArray]] = {}
-        blocks = [signal] if sizes is None else cut(signal, sizes)
-        for index, block in enumerate(blocks):
-            for _, name, value in (change for change in changes if change[0] == index):
-                self.modify(name, value)
-            made = self.process(block)
-            for kind in self.outputs:
-                for name, part in zip(part_names(kind), parts_of(made[kind]), strict=True):
-                    collected.setdefault(name, []).append(part)
-        return {name: np.concatenate(parts, axis=-1) for name, parts in collected.items()}
+
+def core_chain(sample_rate: float, parameters: Mapping[str, Any]) -> Chain:
+    """Return all seven stages of the original; `ihc` is the parent of the last three."""
+    return Chain(sample_rate, CORE_KINDS, parameters)
 
 
 def part_names(kind: str) -> list[str]:
