@@ -82,7 +82,7 @@ def _model() -> DirectionModel:
     rows, random = 4 * cues.CLASSES, np.random.default_rng(4)
     tables = [random.standard_normal((rows * bins + 1, 72)) / 4 for bins in (cues.ITD_BINS, cues.ILD_BINS)]
     about = {"sample_rate": RATE, "parameters": described["parameters"], "head": "", "level_gain_db": 0.0}
-    return DirectionModel({**about, "is_sphere": False}, *tables)
+    return DirectionModel({**about, "is_sphere": False, "max_itd": cues.MAX_ITD}, *tables)
 
 
 def _scene(folder: Path) -> SceneRenderer:
