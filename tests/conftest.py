@@ -53,7 +53,6 @@ LONG_FILES = (  # dozens of seconds of computation; scripts/test --fast has othe
     "ros1/localizer/test_long_silence.py",
     "processing/test_stream.py",
     "validation/test_validate.py",
-    "results/view/test_figure.py",
     "results/view/test_plot.py",
 )
 LONGEST_FILES = (  # they begin first, so that no process works on one of them while the others have nothing to do

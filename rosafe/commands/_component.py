@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import os
 import time
@@ -34,6 +35,12 @@ def prepare(wait: float = 0.0) -> None:
             if time.monotonic() > deadline:
                 raise
         time.sleep(POLL_SECONDS)
+
+
+def add_instance(parser: argparse.ArgumentParser) -> None:
+    """Add -i."""
+    text = f"name of the rosAFE node (default: {ROSAFE.name})"
+    parser.add_argument("-i", "--instance", default=ROSAFE.name, metavar="INSTANCE", help=text)
 
 
 @asynccontextmanager

@@ -65,7 +65,13 @@ def head_of(head: str, mirror: bool | None) -> Any:
     return Head.from_sofa(head, mirror)
 
 
-def ear_channels(text: str) -> tuple[int, int]:
+def add_channels(parser: argparse.ArgumentParser) -> None:
+    """Add --channels."""
+    text = "the channels (from 1) that are the left and the right ear; 1,1 for mono (default: 1,2 of two)"
+    parser.add_argument("--channels", type=_ear_channels, metavar="L,R", help=text)
+
+
+def _ear_channels(text: str) -> tuple[int, int]:
     """Convert the value of --channels, such as ``3,4``."""
     from rosafe.audio.files.audiofile import channel_pair
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_mirror, add_settings, ear_channels, head_of, one_input, parameters_of
+from rosafe.commands._parameters import add_channels, add_mirror, add_settings, head_of, one_input, parameters_of
 from rosafe.system import option_types
 from rosafe.system.output import check_target, write_files
 
@@ -39,12 +39,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add_mirror(parser)
     parser.add_argument("-o", "--to", dest="to", metavar="OUT.wav", required=True, help="the enhanced sound")
-    parser.add_argument(
-        "--channels",
-        metavar="L,R",
-        type=ear_channels,
-        help="channels (from 1) of the left and the right ear",
-    )
+    add_channels(parser)
     add_settings(parser, "rosafe process -h lists them")
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     parser.epilog = (

@@ -11,7 +11,7 @@ import argparse
 import asyncio
 
 from rosafe.commands import CommandError
-from rosafe.commands._component import prepare
+from rosafe.commands._component import add_instance, prepare
 from rosafe.system import option_types
 
 
@@ -29,9 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
     parser.add_argument("--watch", action="store_true", help="read-only page")
     parser.add_argument("--images", action="store_true", help="also publish images for rviz (sensor_msgs/Image)")
-    parser.add_argument(
-        "-i", "--instance", default="rosAFE", metavar="NAME", help="name of the rosAFE node (default: rosAFE)"
-    )
+    add_instance(parser)
     parser.add_argument("--bass", metavar="NAME", help="name of the bass node (default: bass beside the rosAFE node)")
     parser.epilog = (
         "examples:\n"

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_mirror, add_settings, ear_channels, head_of, parameters_of
+from rosafe.commands._parameters import add_channels, add_mirror, add_settings, head_of, parameters_of
 from rosafe.system import option_types
 from rosafe.system.missing import require
 from rosafe.system.output import OutputError, check_target, write_files
@@ -66,9 +66,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--streams", metavar="FOLDER", type=Path, help="write the separated sound of each source, source-ID.wav"
     )
-    parser.add_argument(
-        "--channels", metavar="L,R", type=ear_channels, help="channels (from 1) of the left and the right ear"
-    )
+    add_channels(parser)
     add_settings(parser, "rosafe process -h lists them")
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     _add_node(parser)

@@ -23,11 +23,11 @@ from typing import Any, NamedTuple, cast
 
 from rosafe.commands import CommandError
 from rosafe.commands._parameters import (
+    add_channels,
     add_float_handling,
     add_preset,
     add_settings,
     clipping_warning,
-    ear_channels,
     parameters_of,
     parse_settings,
 )
@@ -52,7 +52,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
         "rosafe process PATH [PATH ...] [-o OUT] [--set NAME=VALUE ...] [--outputs NAME,...]\n"
-        "                      [--format EXT] [--channels A,B] [--topic NAME] [--block N]\n"
+        "                      [--format EXT] [--channels L,R] [--topic NAME] [--block N]\n"
         "                      [--preset NAME] [--pad] [--no-clip]\n"
         "                      [--resume | --force] [--jobs N | --dask ADDRESS|local] [-v | -q]"
     )
@@ -82,12 +82,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         choices=[extension[1:] for extension in _EXTENSIONS],
         help="format of results that -o does not name (default: npz)",
     )
-    parser.add_argument(
-        "--channels",
-        type=ear_channels,
-        metavar="A,B",
-        help="the channels (from 1) that are the left and the right ear; 1,1 for mono (default: 1,2 of two)",
-    )
+    add_channels(parser)
     parser.add_argument(
         "--topic", metavar="NAME", help="topic of the sound in rosbags (default: /bass/Audio, or the only one)"
     )

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rosafe.commands import CommandError
-from rosafe.commands._component import component, format_error, prepare
+from rosafe.commands._component import add_instance, component, format_error, prepare
 from rosafe.declarations import ros_names
 from rosafe.declarations.text import did_you_mean, short_repr
 from rosafe.interface import REQUEST, ROSAFE, ComponentError, Representation
@@ -47,13 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="TOPIC",
         help="topic of the sound for a new input (default: bass/Audio, unless the port Audio is connected)",
     )
-    parser.add_argument(
-        "-i",
-        "--instance",
-        default=ROSAFE.name,
-        metavar="INSTANCE",
-        help=f"name of the node (default: {ROSAFE.name})",
-    )
+    add_instance(parser)
     parser.add_argument("--json", action="store_true", help="print the response of genomixd as JSON")
     parser.set_defaults(interspersed=[])
     parser.epilog = (

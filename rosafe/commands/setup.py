@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from rosafe.commands import CommandError
-from rosafe.commands._component import component, format_error, prepare
+from rosafe.commands._component import add_instance, component, format_error, prepare
 from rosafe.declarations import ros_names
-from rosafe.interface import MAX_SETUP, ROSAFE, ComponentError
+from rosafe.interface import MAX_SETUP, ComponentError
 from rosafe.system import option_types
 from rosafe.system.input import read_regular
 from rosafe.system.output import write_whole
@@ -49,13 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="maximum time to wait for master and nodes that are starting (default: 0)",
     )
-    parser.add_argument(
-        "-i",
-        "--instance",
-        default=ROSAFE.name,
-        metavar="INSTANCE",
-        help=f"name of the rosAFE node (default: {ROSAFE.name})",
-    )
+    add_instance(parser)
     parser.epilog = (
         "exit status: 0 success, 1 refused (nothing was changed), 2 wrong command line\n\n"
         "examples:\n"

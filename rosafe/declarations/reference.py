@@ -184,9 +184,9 @@ class Citation:
         return all(_matches(parameters.get(name, value), value) for name, value in self.when)
 
 
-def cite(key: str, subject: str = "", when: tuple[tuple[str, Any], ...] = ()) -> Citation:
-    """Return a citation of an entry of `literature.bib`."""
-    return Citation(LITERATURE[key], subject, when)
+def cite(key: str, subject: str = "", **when: Any) -> Citation:
+    """Return a citation of an entry of `literature.bib`, which applies if parameters have these values."""
+    return Citation(LITERATURE[key], subject, tuple(when.items()))
 
 
 def _matches(value: Any, expected: Any) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 import rosafe
 from rosafe.representations.registry import builtin_stages
 
-from . import BASS, citation_file, citing, files, functions, reference, ros2
+from . import BASS, citing, files, functions, reference, ros2
 from .rosafe import derive
 
 ROOT = Path(__file__).parents[2]
@@ -30,7 +30,7 @@ def main(argv: list[str] | None = None) -> int:
     expected = files.all_files(ROOT, components) | ros2.all_files(ROOT)
     expected[ROOT / "docs" / "parameters.md"] = reference.markdown(components, kinds)
     expected[ROOT / "docs" / "citing.md"] = citing.markdown(kinds)
-    expected[ROOT / "CITATION.cff"] = citation_file.text(citing.references(kinds.values(), {}))
+    expected[ROOT / "CITATION.cff"] = citing.citation_file(citing.references(kinds.values(), {}))
     expected[ROOT / "rosafe" / "__init__.pyi"] = functions.stub(kinds, rosafe._MODULES, rosafe.__all__)
     stale = files.stale(expected)
     for path in stale:

@@ -92,17 +92,15 @@ class Adaptation(Stage):
         ),
         port_doc="Output of the adaptation loops (model units)",
         references=(
-            cite("puschel1988", "feedback loops", (("adpt_model", ("", "adt_dau", "adt_puschel")),)),
+            cite("puschel1988", "feedback loops", adpt_model=("", "adt_dau", "adt_puschel")),
             cite("dau1996", "feedback loops"),
             cite(
-                "dau1997",
-                "limit of the overshoot",
-                (("adpt_model", ("", "adt_dau", "adt_breebaart", "adt_vandorpschuitman")),),
+                "dau1997", "limit of the overshoot", adpt_model=("", "adt_dau", "adt_breebaart", "adt_vandorpschuitman")
             ),
-            cite("breebaart2001", "time constants", (("adpt_model", "adt_breebaart"),)),
-            cite("vandorp2013", "threshold of each channel", (("adpt_model", "adt_vandorpschuitman"),)),
-            cite("terhardt1979", "threshold of hearing", (("adpt_model", "adt_vandorpschuitman"),)),
-            cite("jepsen2008", "squared input after DRNL filters", (("fb_type", "drnl"),)),
+            cite("breebaart2001", "time constants", adpt_model="adt_breebaart"),
+            cite("vandorp2013", "threshold of each channel", adpt_model="adt_vandorpschuitman"),
+            cite("terhardt1979", "threshold of hearing", adpt_model="adt_vandorpschuitman"),
+            cite("jepsen2008", "squared input after DRNL filters", fb_type="drnl"),
         ),
     )
 

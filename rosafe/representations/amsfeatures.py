@@ -131,9 +131,9 @@ class AmsFeatures(FramedStage):
         port_doc="Amplitude modulation spectrograms, [filter][channel][frame]",
         references=(
             cite("may2014", "amplitude modulation spectrogram"),
-            cite("ewert2000", "modulation filters of constant Q", (("ams_fbType", "log"),)),
-            cite("kim2009", "sums of FFT bins", (("ams_fbType", "lin"),)),
-            cite("kollmeier1994", "sums of FFT bins", (("ams_fbType", "lin"),)),
+            cite("ewert2000", "modulation filters of constant Q", ams_fbType="log"),
+            cite("kim2009", "sums of FFT bins", ams_fbType="lin"),
+            cite("kollmeier1994", "sums of FFT bins", ams_fbType="lin"),
         ),
     )
     prefix = "ams"

@@ -119,10 +119,10 @@ class Filterbank(Stage):
         word="filterbank",
         references=(
             cite("glasberg1990", "spacing of the channels and bandwidth"),
-            cite("patterson1987", "gammatone filters", (("fb_type", "gammatone"),)),
-            cite("hohmann2002", "implementation as a cascade of complex one-pole filters", (("fb_type", "gammatone"),)),
-            cite("lopezpoveda2001", "DRNL filters", (("fb_type", "drnl"),)),
-            cite("jepsen2008", "parameters of the DRNL filters", (("fb_type", "drnl"),)),
+            cite("patterson1987", "gammatone filters", fb_type="gammatone"),
+            cite("hohmann2002", "implementation as a cascade of complex one-pole filters", fb_type="gammatone"),
+            cite("lopezpoveda2001", "DRNL filters", fb_type="drnl"),
+            cite("jepsen2008", "parameters of the DRNL filters", fb_type="drnl"),
         ),
     )
     INPUT = ("ear", "time")

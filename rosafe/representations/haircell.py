@@ -77,11 +77,11 @@ class InnerHairCell(Stage):
         port_doc="Output of each inner hair cell processor",
         word="innerhaircell",
         references=(
-            cite("dau1996", "half-wave rectification and low-pass at 1 kHz", (("ihc_method", ("dau", "dau1996")),)),
-            cite("majdak2022", "order of the low-pass", (("ihc_method", "dau1996"),)),
-            cite("breebaart2001", "half-wave rectification and low-pass of order 5", (("ihc_method", "breebart"),)),
-            cite("bernstein1999", "compression of the envelope and low-pass at 425 Hz", (("ihc_method", "bernstein"),)),
-            cite("jorgensen2011", "envelope and low-pass at 150 Hz", (("ihc_method", "joergensen"),)),
+            cite("dau1996", "half-wave rectification and low-pass at 1 kHz", ihc_method=("dau", "dau1996")),
+            cite("majdak2022", "order of the low-pass", ihc_method="dau1996"),
+            cite("breebaart2001", "half-wave rectification and low-pass of order 5", ihc_method="breebart"),
+            cite("bernstein1999", "compression of the envelope and low-pass at 425 Hz", ihc_method="bernstein"),
+            cite("jorgensen2011", "envelope and low-pass at 150 Hz", ihc_method="joergensen"),
         ),
     )
 

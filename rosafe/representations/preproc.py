@@ -94,33 +94,17 @@ class PreProc(Stage):
         word="time",
         references=(
             cite("twoears2018", "order of the steps"),
-            cite("young2006", "pre-emphasis", (("pp_bPreEmphasis", True),)),
-            cite("tchorz2003", "gain control", (("pp_bNormalizeRMS", True),)),
-            cite("jepsen2008", "level convention", (("pp_bLevelScaling", True),)),
+            cite("young2006", "pre-emphasis", pp_bPreEmphasis=True),
+            cite("tchorz2003", "gain control", pp_bNormalizeRMS=True),
+            cite("jepsen2008", "level convention", pp_bLevelScaling=True),
             cite(
                 "goode1994",
                 "measurements of the middle ear",
-                (
-                    ("pp_bMiddleEarFiltering", True),
-                    ("pp_middleEarModel", "lopezpoveda"),
-                ),
+                pp_bMiddleEarFiltering=True,
+                pp_middleEarModel="lopezpoveda",
             ),
-            cite(
-                "lopezpoveda2001",
-                "middle-ear filter",
-                (
-                    ("pp_bMiddleEarFiltering", True),
-                    ("pp_middleEarModel", "lopezpoveda"),
-                ),
-            ),
-            cite(
-                "jepsen2008",
-                "middle-ear filter",
-                (
-                    ("pp_bMiddleEarFiltering", True),
-                    ("pp_middleEarModel", "jepsen"),
-                ),
-            ),
+            cite("lopezpoveda2001", "middle-ear filter", pp_bMiddleEarFiltering=True, pp_middleEarModel="lopezpoveda"),
+            cite("jepsen2008", "middle-ear filter", pp_bMiddleEarFiltering=True, pp_middleEarModel="jepsen"),
         ),
     )
     INPUT = ("ear", "time")

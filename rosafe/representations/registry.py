@@ -14,7 +14,7 @@ from rosafe.declarations.representation import Representation
 from rosafe.declarations.text import short_repr
 from rosafe.dsp.plugin_checks import checked
 from rosafe.dsp.stage import Stage
-from rosafe.representations import checks, plugin_loader
+from rosafe.representations import plugin_conflicts, plugin_loader
 
 # The processors of the original, in its order, which getParameters and getSignals also use; they report no others.
 CORE_KINDS = ("input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation")
@@ -84,7 +84,7 @@ class _Search:
     def _accept(self, offered: list[tuple[str, type[Stage]]]) -> None:
         """Accept plugins without conflicts, in any order: the parent of a plugin may be another plugin."""
         while offered:
-            accepted = next((one for one in offered if not checks.problem_of(one[1], self.stages)), None)
+            accepted = next((one for one in offered if not plugin_conflicts.problem_of(one[1], self.stages)), None)
             if accepted is None:
                 break
             origin, stage = accepted
@@ -100,7 +100,7 @@ class _Search:
             ]
             offered.remove(accepted)
         for origin, stage in offered:
-            problem = checks.problem_of(stage, self.stages)
+            problem = plugin_conflicts.problem_of(stage, self.stages)
             self.problems.append(f"{origin}: {stage.REPRESENTATION.kind}: {problem}")
 
 

@@ -311,24 +311,3 @@ def test_errors_contain_no_byte_of_another_file(tmp_path: Path, kind: str, begin
     parts = [SECRET[at : at + 3] for at in range(len(SECRET) - 2)]
     leaked = [part for part in parts if repr(part)[2:-1] in text or part.decode("latin-1") in text]
     assert not leaked, text
-
-
-@pytest.mark.parametrize("kind", ["file", "bag"])
-def test_paths_that_are_not_files_are_rejected(tmp_path: Path, kind: str) -> None:
-    os.mkfifo(tmp_path / "fifo")
-    (tmp_path / "link").symlink_to(tmp_path / "fifo")
-    (tmp_path / "round").symlink_to(tmp_path / "round")
-    for path in (
-        "/dev/zero",
-        "/dev/stdin",
-        "/proc/self/mem",
-        "/proc/kmsg",
-        str(tmp_path),
-        "fifo",
-        "link",
-        "round",
-        "a/b",
-    ):
-        with pytest.raises(ComponentError) as caught:
-            open_source(f"{kind}:{tmp_path / path}", 0, 10, threading.Event())
-        assert caught.value.ex == "::bass::e_device"

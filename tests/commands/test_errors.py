@@ -25,32 +25,12 @@ def assert_untouched(folder: Path, *others: str) -> None:
 # --- the input ---
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"", ["bad.wav: expected a sound file, got an empty file"]),
-        (b"no sound at all " * 50, ["bad.wav: expected a sound file, got another file: "]),
-    ],
-)
-def test_other_files_than_sounds(folder: Path, content: bytes, words: list[str]) -> None:
-    (folder / "bad.wav").write_bytes(content)
-    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav", *words)
-    assert_untouched(folder, "bad.wav")
-
-
-@pytest.mark.parametrize("channels", [1, 3])
-def test_other_than_two_channels(folder: Path, channels: int) -> None:
-    write(folder / "bad.wav", np.zeros((channels, 500)))
-    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav", "two channels, left and right ear")
-    assert_untouched(folder, "bad.wav")
-
-
-@pytest.mark.parametrize("name", ["bad.wav", "bad.flac", "bad.aiff"])
-def test_truncated_files(folder: Path, name: str) -> None:
-    whole = write(folder / name, noise(50000)).read_bytes()
-    (folder / name).write_bytes(whole[: len(whole) // 2])
-    refused(rosafe("process", name, cwd=folder), name, "truncated")
-    assert_untouched(folder, name)
+def test_truncated_files(folder: Path) -> None:
+    """tests/audio has the other ones that are refused."""
+    whole = write(folder / "bad.flac", noise(50000)).read_bytes()
+    (folder / "bad.flac").write_bytes(whole[: len(whole) // 2])
+    refused(rosafe("process", "bad.flac", cwd=folder), "bad.flac", "truncated")
+    assert_untouched(folder, "bad.flac")
 
 
 def test_damaged_in_the_middle(folder: Path) -> None:
@@ -74,18 +54,9 @@ def test_missing_folder_and_unreadable(folder: Path) -> None:
 # --- parameters and outputs ---
 
 
-@pytest.mark.parametrize(
-    ("setting", "words"),
-    [
-        ("fb_nChanels=64", ["parameters: expected a known parameter, got 'fb_nChanels'", "fb_nChannels"]),
-        ("fb_nChannels=", ["fb_nChannels", "whole number"]),
-        ("fb_highFreqHz=9000", ["fb_highFreqHz", "half the sample rate"]),  # the file is at 16 kHz
-        ("fb_cfHz=100,abc", ["fb_cfHz", "abc"]),
-    ],
-)
-def test_parameters(folder: Path, setting: str, words: list[str]) -> None:
+def test_parameters(folder: Path) -> None:
     """The checks of `rosafe.process`, which has tests of all of them, apply to texts."""
-    refused(rosafe("process", "in.wav", "--set", setting, cwd=folder), *words)
+    refused(rosafe("process", "in.wav", "--set", "fb_cfHz=100,abc", cwd=folder), "fb_cfHz", "abc")
     assert_untouched(folder)
 
 

@@ -216,30 +216,13 @@ def test_resume(tmp_path: Path, sound: Path, extension: str) -> None:
 # --- inputs ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["a.flac", "a.ogg", "A.WAV"])
-def test_formats_of_sound_files(tmp_path: Path, name: str) -> None:
-    signal = noise(20000) / 4
-    soundfile.write(tmp_path / name, signal.T, RATE, format="WAV" if name.endswith("WAV") else None)
-    done = command("process", name, *SMALL, "-o", "a.npz", "--outputs", "input,ild", cwd=tmp_path)
-    assert done.returncode == 0, done
-    exact = name.endswith(("flac", "WAV"))
-    kind = "int32" if exact else "float64"
-    samples = soundfile.read(tmp_path / name, dtype=kind)[0].T
-    if not exact:
-        samples = np.rint(np.clip(samples * (2**31 - 1), -(2**31), 2**31 - 1)).astype(np.int32)
-    expected = rosafe.process(
-        np.ascontiguousarray(samples), RATE, parameters=SMALL_PARAMETERS, outputs=["input", "ild"]
-    )
+def test_a_sound_file_of_floats(tmp_path: Path) -> None:
+    """tests/audio has the other formats."""
+    soundfile.write(tmp_path / "a.ogg", noise(20000).T / 4, RATE)
+    assert command("process", "a.ogg", *SMALL, "--outputs", "input,ild", cwd=tmp_path).returncode == 0
+    samples = np.rint(soundfile.read(tmp_path / "a.ogg")[0].T * (2**31 - 1)).astype(np.int32)
+    expected = rosafe.process(samples, RATE, parameters=SMALL_PARAMETERS, outputs=["input", "ild"])
     assert_same(rosafe.load(tmp_path / "a.npz"), expected)
-
-
-def test_mp3(tmp_path: Path) -> None:
-    """The decoder adds dither, so that the last of 24 bits differs between two readings."""
-    soundfile.write(tmp_path / "a.mp3", noise(20000).T / 4, RATE)
-    done = command("process", "a.mp3", *SMALL, "--outputs", "input", cwd=tmp_path)
-    assert done.returncode == 0, done
-    samples = soundfile.read(tmp_path / "a.mp3")[0].T
-    np.testing.assert_allclose(rosafe.load(tmp_path / "a.npz")["input"], samples, rtol=0, atol=3e-7)
 
 
 def test_channels(tmp_path: Path) -> None:

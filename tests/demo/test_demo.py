@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from rosafe.commands.demo import Demo, nearest
+from rosafe.commands.demo import DemoSound, nearest
 from rosafe.localization import model_cache
 from rosafe.tree.setups import read, write
 from tests.audio.pulseaudio import PulseServer
@@ -46,24 +46,23 @@ def sound(tmp_path: Path, learn: Learn) -> Path:
 
 def test_scenes_files_and_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    scene = Demo("scene:", 10.0)
-    assert (scene.device, scene.sample_rate) == ("scene:", 44100)
+    scene = DemoSound.of("scene:")
+    assert scene[:2] == ("scene:", 44100)
     assert scene.setup.sound is not None and scene.setup.sound.explicit == {"device": "scene:"}
     file = wav(tmp_path / "my sound.wav", 8000, 2.2)
     file.with_suffix("").symlink_to(file)
     for argument in ("my sound.wav", "./my sound.wav", str(file), "my sound"):
-        demo = Demo(argument, 10.0)
-        assert demo.sample_rate == 8000 and demo.device.startswith(f"file:{tmp_path}/my sound")
-    explicit = {one.kind: one.explicit for one in read(write(demo.setup)).processors}
+        sound = DemoSound.of(argument)
+        assert sound.sample_rate == 8000 and sound.device.startswith(f"file:{tmp_path}/my sound")
+    explicit = {one.kind: one.explicit for one in read(write(sound.setup)).processors}
     assert explicit["gammatone"] == {"fb_highFreqHz": 3600.0} and explicit["input"] == {"nFramesPerBlock": 800}
     for name in ("hw:1,0", "plughw:CARD=PCH,DEV=0", "default", "pulse", "plug:'dmix:0'"):
-        assert (Demo(name, 10.0).device, Demo(name, 10.0).sample_rate) == (name, 44100)
+        assert DemoSound.of(name) == (name, 44100, None)
 
 
 def test_truth_of_several_sources() -> None:
-    azimuths, estimates = [(30.0, 150.0), (-179.0,), ()], np.array([170.0, np.nan, 0.0])
-    np.testing.assert_array_equal(nearest(azimuths, estimates, folded=False), [150.0, -179.0, np.nan])
-    np.testing.assert_array_equal(nearest(azimuths, estimates, folded=True), [30.0, -1.0, np.nan])
+    azimuths = [(30.0, 150.0), (-179.0,), ()]
+    np.testing.assert_array_equal(nearest(azimuths, np.array([170.0, np.nan, 0.0])), [150.0, -179.0, np.nan])
 
 
 # --- complete runs ---
@@ -152,6 +151,7 @@ def test_signal(stage: str, number: signal.Signals, tmp_path: Path, sound: Path)
         for _ in range(20):
             os.killpg(demo.pid, number)
         demo.assert_ends(128 + number)
+    assert stage == "recording" or STAGES["recording"] not in demo.out
     assert not (tmp_path / "rosafe-demo").exists()
 
 

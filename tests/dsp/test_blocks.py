@@ -15,8 +15,9 @@ from rosafe.representations import STAGES
 from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.haircell import InnerHairCell
 from rosafe.representations.preproc import PreProc
+from tests.representations.chain import core_chain
 
-from .bare import Chain, cut, joined, run, single
+from .bare import cut, joined, run, single
 from .stages import CHANNELS, MODES, NAMES, RATE, make, noise, rows
 
 SAMPLES = 600
@@ -68,8 +69,8 @@ def test_whole_chain_sample_by_sample(method: str) -> None:
         "pp_bMiddleEarFiltering": True,
     }
     signal = (noise("input", 900)).astype(np.int32)
-    whole = Chain(RATE, parameters).process(signal)
-    single = joined(Chain(RATE, parameters).run(cut(signal, 1)))
+    whole = core_chain(RATE, parameters).blocks([signal])[0]
+    single = joined(core_chain(RATE, parameters).blocks(cut(signal, 1)))
     assert whole["ild"].shape[-1] == (900 - 320) // 160 + 1
     for kind, expected in whole.items():
         assert_same(single[kind], expected, kind)
@@ -93,8 +94,8 @@ def test_blocks_of_up_to_three_seconds(fb_type: str, method: str, sizes: list[in
         "cc_wname": "blackman",
     }
     signal = noise("preProc", 24000) * np.repeat([1.0, 0.0, 1e-3], 8000)
-    whole = Chain(rate, parameters).process(signal)
-    pieces = joined(Chain(rate, parameters).run(cut(signal, [*sizes, 1000])))
+    whole = core_chain(rate, parameters).blocks([signal])[0]
+    pieces = joined(core_chain(rate, parameters).blocks(cut(signal, [*sizes, 1000])))
     for kind, expected in whole.items():
         assert_same(pieces[kind], expected, kind)
 

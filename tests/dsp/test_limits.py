@@ -17,8 +17,9 @@ from rosafe.representations.input import Input
 from rosafe.representations.preproc import PreProc
 from rosafe.representations.ratemap import Ratemap
 from rosafe.representations.registry import CORE_KINDS
+from tests.representations.chain import core_chain
 
-from .bare import Chain, cut, run, single
+from .bare import cut, run, single
 from .stages import MODES, NAMES, RATE, make, noise, rows
 
 every_mode = pytest.mark.parametrize(("kind", "parameters"), MODES, ids=NAMES)
@@ -63,9 +64,9 @@ def test_finite_through_the_chain(method: str, fb_type: str) -> None:
         "ihc_method": method,
     }
     for name, pattern in PATTERNS.items():
-        chain = Chain(RATE, parameters)
+        chain = core_chain(RATE, parameters)
         for part in cut(np.tile([pattern, -0.1 * pattern], 3), 450):
-            for kind, out in chain.process(part).items():
+            for kind, out in chain.blocks([part])[0].items():
                 assert np.isfinite(out).all(), (name, kind)
                 if kind == "crossCorrelation":
                     assert np.abs(out).max(initial=0.0) <= 1 + 1e-12

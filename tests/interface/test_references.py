@@ -9,7 +9,7 @@ import yaml
 
 from rosafe import plugin
 from rosafe.declarations.reference import LITERATURE, Citation, Reference
-from rosafe.interface import KINDS, citation_file, citing
+from rosafe.interface import KINDS, citing
 from rosafe.representations import BUILTIN
 from rosafe.system.version import AUTHORS, VERSION
 from tests.harness import ROOT
@@ -123,7 +123,7 @@ def test_citation_file_is_complete() -> None:
     cited = citing.references([KINDS[kind] for kind in BUILTIN], {})
     assert [r.get("doi", "") for r in found["references"][1:]] == [one.doi for one in cited]
     assert all(one["authors"] and one["title"] and one["year"] for one in found["references"][1:])
-    assert yaml.safe_load(citation_file.text(cited)) == found
+    assert yaml.safe_load(citing.citation_file(cited)) == found
 
 
 def test_page_lists_every_representation_and_entry() -> None:

@@ -12,7 +12,7 @@ import tomllib
 from rosafe.declarations.representation import Derived
 from rosafe.declarations.signals import layout
 from rosafe.interface import KINDS, ROSAFE
-from rosafe.representations import checks
+from rosafe.representations import plugin_conflicts
 
 from .support import python
 
@@ -96,8 +96,10 @@ def test_a_derived_value_needs_no_description() -> None:
 def test_the_reserved_names_are_those_of_the_component() -> None:
     kinds = [name for kind in KINDS.values() for name in (kind.request, *kind.request_aliases)]
     requests = {name for s in (*ROSAFE.on_graph, *ROSAFE.client_side_services) for name in (s.name, *s.aliases)}
-    assert requests - set(kinds) == set(checks.REQUESTS)
+    assert requests - set(kinds) == set(plugin_conflicts.REQUESTS)
     ports = {name for port in ROSAFE.ports for name in (port.name, *port.aliases)}
-    assert ports - {name for kind in KINDS.values() for name in (kind.port, *kind.port_aliases)} < set(checks.PORTS)
+    assert ports - {name for kind in KINDS.values() for name in (kind.port, *kind.port_aliases)} < set(
+        plugin_conflicts.PORTS
+    )
     messages = {layout(kind).idl for kind in KINDS.values() if len(kind.parts) == 1}
-    assert messages == {f"::rosAFE::{name}SignalPortStruct" for name in checks.STRUCTS}
+    assert messages == {f"::rosAFE::{name}SignalPortStruct" for name in plugin_conflicts.STRUCTS}

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 import rosafe
 from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.representations import STAGES
-from tests.dsp.bare import Chain, cut
+from tests.dsp.bare import cut
+from tests.representations.chain import core_chain
 
 RATE = 16000.0
 BLOCK, BLOCKS = 700, 5
@@ -80,7 +81,7 @@ def unchanged() -> dict[str, Any]:
 def test_a_change_of(name: str, unchanged: dict[str, Any]) -> None:
     kind = KIND_OF[name]
     got = rosafe.process(SOUND, RATE, parameters=BASE, block_frames=BLOCK, modifications=[(AT, name, CHANGES[name])])
-    outputs = Chain(RATE, BASE).run(cut(SOUND, BLOCK), [(AT, name, CHANGES[name])])
+    outputs = core_chain(RATE, BASE).blocks(cut(SOUND, BLOCK), [(AT, name, CHANGES[name])])
     for other in CORE_REPRESENTATIONS:
         whole = unchanged[other]
         if other not in below(kind):

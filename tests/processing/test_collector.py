@@ -12,7 +12,8 @@ from rosafe.dsp import kernels
 from rosafe.processing.collector import OutputCollector
 from rosafe.representations import STAGES
 from rosafe.representations.haircell import METHODS, InnerHairCell
-from tests.dsp.bare import Chain, cut
+from tests.dsp.bare import cut
+from tests.representations.chain import core_chain
 
 pytestmark = [
     pytest.mark.skipif(not kernels.compiled(), reason="numpy's twin of the hair cell's kernel returns its own"),
@@ -59,7 +60,7 @@ def test_the_same_numbers_without_a_copy(
     sound = SOUND[:, :200] if block == [1] else SOUND
     got = rosafe.process(sound, RATE, parameters={**FEW, **parameters}, block_frames=block, outputs=[kind])[kind]
     assert copied == []
-    outputs = Chain(RATE, {"in_doNormalize": False, **FEW, **parameters}).run(cut(sound, block))
+    outputs = core_chain(RATE, {"in_doNormalize": False, **FEW, **parameters}).blocks(cut(sound, block))
     np.testing.assert_array_equal(got, np.concatenate([output[kind] for output in outputs], axis=-1))
 
 
@@ -77,7 +78,7 @@ def test_a_change_of_the_rows_ends_writing_in_place(copied: list[int]) -> None:
     options: dict[str, Any] = {"block_frames": 600, "modifications": changes, "outputs": ["gammatone"]}
     got = rosafe.process(SOUND, RATE, parameters=FEW, **options)["gammatone"]
     assert copied == [600] * 3
-    outputs = Chain(RATE, {"in_doNormalize": False, **FEW}).run(cut(SOUND, 600), changes)
+    outputs = core_chain(RATE, {"in_doNormalize": False, **FEW}).blocks(cut(SOUND, 600), changes)
     for number, output in enumerate(outputs):
         part = got[..., 600 * number : 600 * (number + 1)]
         channels = output["gammatone"].shape[1]
@@ -147,7 +148,7 @@ def test_inputs_without_other_consumers_are_overwritten(
     """`process` and `Stream` return the same numbers, and the signal remains unchanged."""
     sound, parameters = SOUND[:, :200] if block == [1] else SOUND, {**FEW, "fb_type": kind, "ihc_method": method}
     given, parts = sound.copy(), cut(sound, block)
-    outputs = Chain(RATE, {"in_doNormalize": False, **parameters}).run(parts)
+    outputs = core_chain(RATE, {"in_doNormalize": False, **parameters}).blocks(parts)
     assert not any(overwritten)
     overwritten.clear()
     wanted = ["ild", "ratemap", "crossCorrelation"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -10,11 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import rosafe
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Output, Stage, parts_of
 from rosafe.representations import KINDS, STAGES
+from rosafe.representations.registry import CORE_KINDS
 from tests import harness
-from tests.dsp.bare import FloatArray, cut
+from tests.dsp.bare import FloatArray, cut, joined
 
 
 def kinds_of(name: str) -> list[str]:
@@ -107,40 +110,35 @@ class Chain:
             made[kind] = stage.process(data, parent.provided[stage.required_extra] if stage.required_extra else None)
         return made
 
+    def blocks(
+        self, blocks: Iterable[NDArray[Any]], changes: Iterable[Sequence[Any]] = ()
+    ) -> list[dict[str, FloatArray]]:
+        """Return `outputs` for each block, by the names of `rosafe.process`: the parts of a kind are `<kind>_<part>`.
+
+        `changes` are (block index, parameter, value), applied before that block.
+        """
+        changes, made = list(changes), []
+        for index, block in enumerate(blocks):
+            for _, name, value in (change for change in changes if change[0] == index):
+                self.modify(name, value)
+            of_stages = self.process(block)
+            pairs = [zip(part_names(kind), parts_of(of_stages[kind]), strict=True) for kind in self.outputs]
+            made.append(dict(itertools.chain(*pairs)))
+        return made
+
     def run(
         self,
         signal: NDArray[Any],
         sizes: int | Sequence[int] | None = None,
         changes: Iterable[Sequence[Any]] = (),
     ) -> dict[str, FloatArray]:
-        """Return `outputs` for a signal (..., N) in blocks of `sizes`, concatenated, by the names of `rosafe.process`.
+        """Return the concatenated outputs for a signal (..., N) in blocks of `sizes`; see `blocks`."""
+        return joined(self.blocks([signal] if sizes is None else cut(signal, sizes), changes))
 
-        `changes` are (block index, parameter, value), applied before that block. The parts of a kind are named
-        `<kind>_<part>`. If a change alters the leading shape, the result has the largest one, filled with 0; the axis
-        `centred` is aligned at its middle.
-        """
-        changes = list(changes)
-        collected: dict[str, list[FloatArray]] = {}
-        blocks = [signal] if sizes is None else cut(signal, sizes)
-        for index, block in enumerate(blocks):
-            for _, name, value in (change for change in changes if change[0] == index):
-                self.modify(name, value)
-            made = self.process(block)
-            for kind in self.outputs:
-                for name, part in zip(part_names(kind), parts_of(made[kind]), strict=True):
-                    collected.setdefault(name, []).append(part)
-        return {name: _joined(name, parts) for name, parts in collected.items()}
 
-    def coordinates(self) -> dict[str, Any]:
-        """Return the coordinates of `outputs`, and `<kind>_frameRate` of framed ones."""
-        found: dict[str, Any] = {}
-        for kind in self.outputs:
-            stage = self.stages[kind]
-            known = {**stage.parameters, **stage.derived}
-            found.update((name, known[name]) for name in KINDS[kind].coordinates)
-            if stage.output_format.framed:
-                found[f"{kind}_frameRate"] = stage.output_format.rate
-        return found
+def core_chain(sample_rate: float, parameters: Mapping[str, Any]) -> Chain:
+    """Return all seven stages of the original; `ihc` is the parent of the last three."""
+    return Chain(sample_rate, CORE_KINDS, parameters)
 
 
 def part_names(kind: str) -> list[str]:
@@ -149,45 +147,11 @@ def part_names(kind: str) -> list[str]:
     return [kind] if len(parts) == 1 else [f"{kind}_{part.name}" for part in parts]
 
 
-def _joined(name: str, blocks: Sequence[FloatArray]) -> FloatArray:
-    if len({block.shape[:-1] for block in blocks}) == 1:
-        return np.concatenate(blocks, axis=-1)
-    declared = KINDS[name.split("_")[0]]
-    axes = declared.parts[part_names(declared.kind).index(name)].axes
-    shape = tuple(max(sizes) for sizes in zip(*(block.shape[:-1] for block in blocks), strict=True))
-    joined = np.zeros((*shape, sum(block.shape[-1] for block in blocks)))
-    at = 0
-    for block in blocks:
-        place = [slice(0, size) for size in block.shape]
-        place[-1] = slice(at, at + block.shape[-1])
-        if declared.centred in axes:
-            axis = axes.index(declared.centred)
-            first = (shape[axis] - block.shape[axis]) // 2
-            place[axis] = slice(first, first + block.shape[axis])
-        joined[tuple(place)] = block
-        at += block.shape[-1]
-    return joined
-
-
-def process(
-    signal: NDArray[Any],
-    sample_rate: float,
-    outputs: Iterable[str],
-    parameters: Mapping[str, Any] | None = None,
-    sizes: int | Sequence[int] | None = None,
-    changes: Iterable[Sequence[Any]] = (),
-) -> dict[str, Any]:
-    """Do the same as `rosafe.process` without the tree: `outputs` of a signal (2, N), with coordinates and rates."""
-    values = {"in_doNormalize": signal.dtype.kind == "i", **(parameters or {})}
-    chain = Chain(sample_rate, outputs, values)
-    return {**chain.run(signal, sizes, changes), **chain.coordinates()}
-
-
 # --- vectors ----------------------------------------------------------------------------------------------------
 
 
-def reference(name: str) -> tuple[dict[str, Any], dict[str, FloatArray], dict[str, Any]]:
-    """Return the case of the manifest for a file of ../shared/vectors/more, the expected results and the computed ones.
+def reference(name: str) -> tuple[dict[str, FloatArray], dict[str, Any]]:
+    """Return the expected results for a file of ../shared/vectors/more, and those of `rosafe.process`.
 
     Computed results are decimated as the expected ones; rates and coordinates have been compared.
     """
@@ -195,7 +159,8 @@ def reference(name: str) -> tuple[dict[str, Any], dict[str, FloatArray], dict[st
     (case,) = (case for case in cases if case["name"] == name)
     with np.load(harness.shared("vectors", "more", case["file"])) as arrays:
         stored = dict(arrays)
-    got = process(stored["signal"], case["fs"], case["outputs"], case["params"], case["chunks"], case["mods"])
+    options = {"parameters": case["params"], "block_frames": case["chunks"], "modifications": case["mods"]}
+    got = rosafe.process(stored["signal"], case["fs"], outputs=case["outputs"], **options)
     for output, shape in case["full_shapes"].items():
         assert got[output].shape == tuple(shape)
     for output, axes in case["crops"].items():
@@ -208,4 +173,4 @@ def reference(name: str) -> tuple[dict[str, Any], dict[str, FloatArray], dict[st
         if coordinate in ("ac_lags", "prec_lags"):
             found = [len(found), found[-1] if coordinate == "ac_lags" else found[0]]
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=0, err_msg=coordinate)
-    return case, {output: stored[output] for output in case["full_shapes"]}, got
+    return {output: stored[output] for output in case["full_shapes"]}, got

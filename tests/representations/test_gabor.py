@@ -10,7 +10,7 @@ import pytest
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.representations.gabor import Gabor, RunningZScore, filters, patterns
 
-from .chain import Chain, FloatArray, cut, reference
+from .chain import FloatArray, cut
 
 REACH = 19
 
@@ -94,11 +94,6 @@ def by_definition(x: FloatArray, dynamic_range: float, remembered: int) -> Float
         steady = sigma <= 1e-9 * (1 + np.abs(mean))
         z[..., k] = np.where(steady, 0, (y[..., k] - mean) / np.where(steady, 1, sigma))
     return z
-
-
-def test_reference_vector() -> None:
-    _, expected, got = reference("Q10_gabor")
-    np.testing.assert_allclose(got["gabor"], expected["gabor"], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("channels", "count"), [(16, 221), (23, 311), (31, 455), (32, 464), (64, 923)])
@@ -279,16 +274,3 @@ def test_another_step_of_the_parent_keeps_past_values() -> None:
     # a maximum 5 frames ago counts for 15 frames before the change, and for 5 after it
     expected = by_definition(x, 80.0, 5)
     np.testing.assert_allclose(second[..., 50 + REACH + 4 - 31 :], expected[..., 50 + REACH + 4 :], rtol=0, atol=1e-8)
-
-
-def test_changes_in_a_chain() -> None:
-    x = np.random.default_rng(0).standard_normal((2, 24000))
-    values = {"fb_nChannels": 4, "fb_highFreqHz": 3000.0, "in_doNormalize": False}
-    chain = Chain(8000.0, ["gabor"], values)
-    changes = [(1, "gb_maxDynamicRangeDB", 40.0), (1, "rm_hSizeSec", 0.02), (2, "fb_nChannels", 6)]
-    made = chain.run(x, 8000, changes)["gabor"]
-    before, after = len(weights_by_definition(4)), len(weights_by_definition(6))
-    frames = [99 - 19, 50, 50 - 19]  # after the change of channels, 19 frames are dropped
-    assert made.shape == (2, after, sum(frames))
-    assert not made[:, before:, : sum(frames[:2])].any()
-    assert np.isfinite(made).all()

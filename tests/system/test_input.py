@@ -18,6 +18,9 @@ from rosafe.audio.files.bagsound import BagSoundError, Recording
 from rosafe.commands import CommandError
 from rosafe.commands.setup import read_file
 from rosafe.interface import ComponentError
+from rosafe.localization import results
+from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.noise import NoiseCalibration
 from rosafe.processing.corpus import write_failed
 from rosafe.processing.files import process_file
 from rosafe.system import input as inputs
@@ -26,7 +29,14 @@ from rosafe.tree.setups import Setup
 from rosafe.tree.setups.state_file import TreeStateFile
 from tests.harness import PYTHON, SCRIPTS, Graph, proc
 
-RESULTS = (".npz", ".h5")
+BY_SUFFIX: dict[str, Callable[[Path], object]] = {
+    ".npz": rosafe.load,
+    ".h5": rosafe.load,
+    ".sofa": rosafe.Head.from_sofa,
+    ".head": DirectionModel.load,
+    ".json": NoiseCalibration.load,
+    ".csv": results.read_yaw,
+}
 ERRORS = (OSError, ValueError, AudioFileError, BagSoundError, ComponentError, CommandError)
 READERS: dict[str, Callable[[Path], object]] = {
     "sound": AudioFile,
@@ -35,7 +45,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "kept": lambda path: TreeStateFile(path, Setup, print).saved(),
     "offline": lambda path: process_file(path, path.with_name("out.npz")),
     "failed.csv": lambda path: write_failed(path.parent, [], {"a": "b"}),
-    **dict.fromkeys(RESULTS, rosafe.load),
+    **BY_SUFFIX,
 }
 
 
@@ -54,7 +64,7 @@ def special_file(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("reader", READERS)
 def test_special_file_is_rejected(special_file: Path, reader: str) -> None:
-    name = reader if reader == "failed.csv" else f"special{reader}" if reader in RESULTS else "special"
+    name = reader if reader == "failed.csv" else f"special{reader}" if reader in BY_SUFFIX else "special"
     path = special_file.with_name(name)
     if path != special_file:
         special_file.rename(path)

@@ -12,8 +12,8 @@ from rosafe.interface import CORE_REPRESENTATIONS, ComponentError
 from rosafe.tree import sizes
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
-from tests.dsp.bare import Chain
 from tests.harness import PATIENCE, run_together
+from tests.representations.chain import Chain, core_chain
 
 from .support import CHANNELS, RATE, Feed, Plain, Recorder, grow, use_plain_stages
 
@@ -74,7 +74,7 @@ def settle(tree: Tree, feed: Feed, listener: Recorder, *blocks: np.ndarray) -> N
 
 
 def chain(**parameters: Any) -> Chain:
-    return Chain(RATE, {"in_doNormalize": False, **CHANNELS, **parameters})
+    return core_chain(RATE, {"in_doNormalize": False, **CHANNELS, **parameters})
 
 
 def assert_as(listener: Recorder, tree: Tree, kind: str, outputs: list[dict[str, np.ndarray]]) -> None:
@@ -102,7 +102,7 @@ def test_a_change_of_each_parameter(tree: Tree, feed: Feed, listener: Recorder, 
     assert processor.stage.parameters[name] == value
     assert {p.name: p.stage.parameters for p in tree.processors if p is not processor} == others
     settle(tree, feed, listener, *NOISE[3:6])
-    outputs = chain().run(list(NOISE[:6]), [(3, name, value)])
+    outputs = chain().blocks(list(NOISE[:6]), [(3, name, value)])
     for kind in ("preProc", "gammatone", "ihc", *LEAVES):
         assert_as(listener, tree, kind, outputs)
     assert processor.stage.parameters[name] == value
@@ -192,7 +192,7 @@ def test_a_rejected_change_has_no_effect_on_the_numbers(
         with pytest.raises(ComponentError, match="refused"):
             tree.modify(OWNER[name], name, text)
     settle(tree, feed, listener, *NOISE[2:4])
-    outputs = chain().run(list(NOISE[:4]))
+    outputs = chain().blocks(list(NOISE[:4]))
     for kind in CORE_REPRESENTATIONS:
         assert_as(listener, tree, kind, outputs)
 
@@ -206,7 +206,7 @@ def test_changes_accumulate_until_the_next_block(tree: Tree, feed: Feed, listene
     with pytest.raises(ComponentError):
         tree.modify("gammatone", "fb_lowFreqHz", "3500")  # rejected because of a change that waits for the next block
     settle(tree, feed, listener, *NOISE[2:4])
-    outputs = chain().run(list(NOISE[:4]), [(2, name, float(text)) for name, text in changes])
+    outputs = chain().blocks(list(NOISE[:4]), [(2, name, float(text)) for name, text in changes])
     assert_as(listener, tree, "gammatone", outputs)
     assert_as(listener, tree, "crossCorrelation", outputs)
 

@@ -33,7 +33,7 @@ def provided(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     answers: list[bool] = []
     original = STAGES["gammatone"].process
 
-    def process(self: Any, block: np.ndarray) -> Output:
+    def process(self: Any, block: np.ndarray, extra: None = None) -> Output:
         answers.append("envelope" in self.provide)
         return original(self, block)
 
@@ -63,9 +63,9 @@ def test_the_envelope_is_computed_only_while_a_child_requires_it(
     tree.remove("late")
     settle(tree, feed, listener, *NOISE[6:8])
     assert provided == [False] * 3 + [True] * 3 + [False] * 2
-    outputs = joined(chain(ihc_method="hilbert").run(list(NOISE[:6])))
+    outputs = joined(chain(ihc_method="hilbert").blocks(list(NOISE[:6])))
     assert suffix(listener, late, outputs["ihc"]) == 3
-    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:8])))
+    assert_as(listener, tree, "ihc", chain().blocks(list(NOISE[:8])))
 
 
 @pytest.mark.parametrize("method", ["hilbert", "joergensen", "bernstein"])
@@ -108,7 +108,7 @@ def test_a_live_switch_to_the_envelope_and_back_loses_no_block(
     settle(tree, feed, listener, *NOISE[6:8])
     assert provided == [False] * 3 + [True] * 3 + [False] * 2
     changes = [(3, "ihc_method", "hilbert"), (6, "ihc_method", "fullwave")]
-    outputs = chain().run(list(NOISE[:8]), changes)
+    outputs = chain().blocks(list(NOISE[:8]), changes)
     for kind in ("ihc", *LEAVES):
         assert_as(listener, tree, kind, outputs)
 
@@ -135,7 +135,7 @@ def test_a_released_block_without_the_envelope_is_processed_by_the_old_method(
     feed.put(*NOISE[2:4])
     go_on.set()
     listener.wait_blocks(ihc, 4)
-    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:4]), [(2, "ihc_method", "hilbert")]))
+    assert_as(listener, tree, "ihc", chain().blocks(list(NOISE[:4]), [(2, "ihc_method", "hilbert")]))
 
 
 def test_a_block_without_the_envelope_is_not_lost(
@@ -151,7 +151,7 @@ def test_a_block_without_the_envelope_is_not_lost(
             assert go_on.wait(PATIENCE)
         return original(self, block, *envelope)
 
-    first = chain().run([NOISE[0]])[0]["gammatone"]
+    first = chain().blocks([NOISE[0]])[0]["gammatone"]
     monkeypatch.setattr(InnerHairCell, "process", process)
     grow(tree, feed)
     filterbank, ihc = tree.find("gammatone"), tree.find("ihc")
@@ -166,7 +166,7 @@ def test_a_block_without_the_envelope_is_not_lost(
     go_on.set()
     listener.wait_blocks(ihc, 3)
     changes = [(0, "ihc_method", "hilbert"), (1, "ihc_method", "fullwave"), (2, "ihc_method", "hilbert")]
-    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:3]), changes))
+    assert_as(listener, tree, "ihc", chain().blocks(list(NOISE[:3]), changes))
 
 
 def test_a_switch_while_blocks_are_processed(tree: Tree, feed: Feed, listener: Recorder) -> None:
@@ -180,7 +180,7 @@ def test_a_switch_while_blocks_are_processed(tree: Tree, feed: Feed, listener: R
     listener.wait_blocks(ihc, 15)
     settle(tree, feed, listener, *NOISE[15:])
     methods = ("dau", "hilbert", "none", "fullwave")
-    outputs = {method: chain(ihc_method=method).run(list(NOISE)) for method in methods}
+    outputs = {method: chain(ihc_method=method).blocks(list(NOISE)) for method in methods}
     names = []
     for number, block in enumerate(listener.blocks[ihc]):
         fits = [m for m in methods[1:] if np.allclose(block.data, outputs[m][number]["ihc"], rtol=0, atol=1e-12)]
@@ -199,4 +199,4 @@ def test_a_switch_and_its_reversal_before_a_block_have_no_effect(
     tree.modify("ihc", "ihc_method", "fullwave")
     settle(tree, feed, listener, *NOISE[2:5])
     assert provided == [False] * 5
-    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:5]), [(2, "ihc_method", "fullwave")]))
+    assert_as(listener, tree, "ihc", chain().blocks(list(NOISE[:5]), [(2, "ihc_method", "fullwave")]))

@@ -110,25 +110,18 @@ def test_the_order_of_checks(afe: Session) -> None:
 
 
 OUT_OF_RANGE: tuple[tuple[str, dict[str, Any], str], ...] = (
-    ("PreProc", {"pp_cutoffHzDC": math.nan}, "pp_cutoffHzDC"),
-    ("PreProc", {"pp_bRemoveDC": True, "pp_cutoffHzDC": RATE / 2}, "pp_cutoffHzDC"),
     ("PreProc", {"name": "white space"}, "name"),
     ("PreProc", {"name": "a//b"}, "name"),
     ("PreProc", {"name": "x" * 5000}, "name"),
     ("GammatoneProc", {"fb_highFreqHz": float(RATE)}, "fb_highFreqHz"),
-    ("GammatoneProc", {"fb_lowFreqHz": 3000.0, "fb_highFreqHz": 2000.0}, "fb_"),
-    ("GammatoneProc", {"fb_nERBs": 1e-12}, "fb_nERBs"),
-    ("GammatoneProc", {"fb_cfHz": [100.0, math.nan]}, "fb_cfHz"),
-    ("GammatoneProc", {"fb_cfHz": [100.0, RATE * 1.0]}, "fb_cfHz"),
     ("GammatoneProc", {"fb_cfHz": [100.0] * 5000}, "fb_cfHz"),
-    ("IldProc", {"ild_hSizeSec": 1e-9}, "ild_hSizeSec"),
     ("CrossCorrelationProc", {"cc_maxDelaySec": 9.9, "cc_hSizeSec": 0.0001}, "port or history"),
-    ("InputProc", {"bufferSize_s_port": 1e9}, "bufferSize_s_port"),
     ("InputProc", {"nFramesPerBlock": 2**32 - 1}, "nFramesPerBlock"),
 )
 
 
 def test_values_out_of_range_are_rejected_with_the_reason(afe: Session) -> None:
+    """tests/interface and tests/tree have the rules."""
     afe.build("PreProc", "GammatoneProc", "IhcProc", fb_nChannels=2)
     before = snapshot(afe)
     for request_name, values, named in OUT_OF_RANGE:
@@ -157,25 +150,9 @@ def test_zeros_are_defaults(afe: Session) -> None:
 
 
 def test_unknown_choices_are_replaced(afe: Session) -> None:
-    afe.build(
-        "PreProc",
-        "GammatoneProc",
-        "IhcProc",
-        "IldProc",
-        "RatemapProc",
-        fb_nChannels=2,
-        pp_middleEarModel="jespen",
-        fb_type="string",
-        ihc_method="whatever",
-        ild_wname="boxcar",
-        rm_scaling="loud",
-    )
+    afe.build("PreProc", "GammatoneProc", "IhcProc", fb_nChannels=2, pp_middleEarModel="jespen", ihc_method="whatever")
     parameters = afe.ok("getParameters").parameters
-    assert parameters.preProc[0].pp_middleEarModel == "jepsen"
-    assert parameters.gammatone[0].fb_type == "gammatone"
-    assert parameters.ihc[0].ihc_method == "dau"
-    assert parameters.ild[0].ild_wname == "hann"
-    assert parameters.ratemap[0].rm_scaling == "power"
+    assert (parameters.preProc[0].pp_middleEarModel, parameters.ihc[0].ihc_method) == ("jepsen", "dau")
 
 
 def test_a_window_too_short_for_the_pitch_range_is_logged_once(afe: Session) -> None:
@@ -261,19 +238,10 @@ def test_dependencies_start_at_the_root(afe: Session) -> None:
 
 
 MODIFICATIONS: tuple[tuple[str, str, str, Any], ...] = (
-    ("input", "in_doNormalize", "0", False),
-    ("input", "in_doNormalize", " true ", True),
     ("input", "in_normalizeValue", "18446744073709551615", 2**64 - 1),
     ("preProc", "pp_refSPLdBS", "-3.5e1", -35.0),
-    ("preProc", "pp_refSPLdB", "0", 0.0),
-    ("preProc", "pp_middleEarModel", "jespen", "jepsen"),
-    ("gammatone", "fb_nGamma", "3", 3),
-    ("gammatone", "fb_bwERBs", "20E-1", 2.0),
-    ("ihc", "ihc_method", "dau1996", "dau1996"),
     ("ihc", "ihc_method", "unheard of", "dau"),
-    ("ild", "ild_wname", "hamming", "hamming"),
     ("ratemap", "set_rm_scailing", "_magnitude", "magnitude"),
-    ("ratemap", "rm_decaySec", ".02", 0.02),
     ("crosscorrelation", "cc_maxDelaySec", "0.0005", 0.0005),
 )
 
@@ -295,32 +263,16 @@ REJECTED = (
     ("", "", "", "e_noSuchProcessor"),
     ("input", "pp_bRemoveDC", "1", "e_noSuchParameter"),  # the guide's own example
     ("preProc", "pp_nothing", "", "e_noSuchParameter"),
-    ("input", "in_doNormalize", "2", "e_badNewValue"),
-    ("input", "in_doNormalize", "TRUE", "e_badNewValue"),
-    ("input", "in_doNormalize", "", "e_badNewValue"),
-    ("input", "in_normalizeValue", "0", "e_badNewValue"),
-    ("input", "in_normalizeValue", "5.0", "e_badNewValue"),
-    ("input", "in_normalizeValue", "-1", "e_badNewValue"),
-    ("input", "in_normalizeValue", "18446744073709551616", "e_badNewValue"),
     ("input", "in_normalizeValue", "9" * 4000, "e_badNewValue"),
     ("preProc", "pp_refSPLdB", "nan", "e_badNewValue"),
-    ("preProc", "pp_refSPLdB", "1e999", "e_badNewValue"),
-    ("preProc", "pp_refSPLdB", "0x10", "e_badNewValue"),
-    ("preProc", "pp_refSPLdB", "1,5", "e_badNewValue"),
-    ("preProc", "pp_refSPLdB", "12abc", "e_badNewValue"),
     ("preProc", "pp_cutoffHzDC", "10000", "e_badNewValue"),
-    ("preProc", "pp_cutoffHzDC", "0", "e_badNewValue"),
-    ("gammatone", "fb_nGamma", "0", "e_badNewValue"),
-    ("gammatone", "fb_nGamma", "1e3", "e_badNewValue"),
-    ("gammatone", "fb_highFreqHz", "10001", "e_badNewValue"),
     ("gammatone", "fb_cfHz", "[100, nan]", "e_badNewValue"),
-    ("ild", "ild_hSizeSec", "-0.01", "e_badNewValue"),
-    ("ratemap", "rm_decaySec", "inf", "e_badNewValue"),
     ("crosscorrelation", "cc_maxDelaySec", "10.5", "e_badNewValue"),
 )
 
 
 def test_rejected_modifications(afe: Session) -> None:
+    """tests/interface and tests/tree have the rules."""
     afe.build(*CHAIN, fb_nChannels=2, pp_bRemoveDC=True)
     before = snapshot(afe)
     for name, parameter, text, ex in REJECTED:

@@ -80,41 +80,22 @@ def test_words_stay_as_they_are() -> None:
     assert complete(PRE, {"pp_middleEarModel": "jespen"})["pp_middleEarModel"] == "jespen"
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [("1", True), ("0", False), ("true", True), ("False", False), ("yes", True), ("no", False), ("T", True)],
+VALUES: tuple[tuple[Service, str, Any, list[Any]], ...] = (
+    (PRE, "pp_bRemoveDC", True, ["1", "true", "yes", "T", 1]),
+    (PRE, "pp_bRemoveDC", False, ["0", "False", "no", 0]),
+    (PRE, "pp_cutoffHzDC", 20.0, ["20", "2E1", " 20. ", 20]),
+    (INPUT, "nFramesPerBlock", 2**32 - 1, ["4294967295", 4294967295.0]),
+    (GAMMATONE, "fb_cfHz", [0.5, 200.0], [["0.5", "200"], [0.5, 200], {"1": 200, "0": ".5"}]),
+    (GAMMATONE, "fb_cfHz", [], [[], {}, 0, [0], "", "0", None]),
+    (GAMMATONE, "fb_cfHz", [440.0], [440, "440"]),
 )
-def test_booleans_as_text(text: str, value: bool) -> None:
-    assert complete(PRE, {"pp_bRemoveDC": text})["pp_bRemoveDC"] is value
-    assert complete(PRE, {"pp_bRemoveDC": int(value)})["pp_bRemoveDC"] is value
 
 
-@pytest.mark.parametrize(("text", "value"), [("20E-3", 0.02), (" 5 ", 5.0), ("-.5", -0.5), (7, 7.0)])
-def test_numbers_as_text(text: Any, value: float) -> None:
-    assert complete(PRE, {"pp_cutoffHzDC": text})["pp_cutoffHzDC"] == value
-
-
-def test_whole_numbers_keep_all_their_digits() -> None:
-    assert complete(INPUT, {"nFramesPerBlock": "4294967295"})["nFramesPerBlock"] == 2**32 - 1
-    assert complete(INPUT, {"nFramesPerBlock": 12000.0})["nFramesPerBlock"] == 12000
-
-
-@pytest.mark.parametrize(
-    "given",
-    [[100, 200.5], ["100", "200.5"], {"0": 100, "1": 200.5}, {"1": 200.5, "0": "100"}],
-)
-def test_sequences(given: Any) -> None:
-    assert complete(GAMMATONE, {"fb_cfHz": given})["fb_cfHz"] == [100.0, 200.5]
-
-
-@pytest.mark.parametrize("given", [[], {}, 0, [0], "", "0", None])
-def test_values_that_stand_for_an_empty_list(given: Any) -> None:
-    assert complete(GAMMATONE, {"fb_cfHz": given})["fb_cfHz"] == []
-
-
-def test_a_single_number_is_a_list_of_one() -> None:
-    assert complete(GAMMATONE, {"fb_cfHz": 440})["fb_cfHz"] == [440.0]
-    assert complete(GAMMATONE, {"fb_cfHz": "440"})["fb_cfHz"] == [440.0]
+@pytest.mark.parametrize(("service", "name", "value", "given"), VALUES)
+def test_values_of_clients(service: Service, name: str, value: Any, given: list[Any]) -> None:
+    for one in given:
+        got = complete(service, {name: one})[name]
+        assert got == value and isinstance(got, bool) is isinstance(value, bool), one
 
 
 @pytest.mark.parametrize(
