@@ -61,7 +61,8 @@ class Candidate(NamedTuple):
     share: float  # 0 to 1
     power: float = 0.0  # of the units that it explains, as the ratemap has it, mean over the frames
     salience: float = 1.0  # part of its evidence that is above the noise
-    odds: float = 0.0  # log-odds of the direction against its front-back image
+    odds: float = 0.0  # log-odds of the direction against its front-back image, from the units of both
+    own_odds: float = 0.0  # the same from its own units
 
 
 class Mixture(NamedTuple):
@@ -149,7 +150,7 @@ def candidates(units: Units, yaw: float) -> list[Candidate]:
                 float(share[peak] / max(rest, MIN_REST)),
                 float(part @ units.powers),
                 salience,
-                _front_back_odds(units, mixture, near, peak, yaw),
+                *_front_back_odds(units, mixture, near, peak, yaw),
             )
         )
         if salience < MIN_SALIENCE:
@@ -158,21 +159,22 @@ def candidates(units: Units, yaw: float) -> list[Candidate]:
     return _without_images(found, units.evidence, yaw)
 
 
-def _front_back_odds(units: Units, mixture: Mixture, near: NDArray[np.bool_], peak: int, yaw: float) -> float:
+def _front_back_odds(units: Units, mixture: Mixture, near: NDArray[np.bool_], peak: int, yaw: float) -> list[float]:
     """Return the log-odds of directions `near` (A,) a peak against their front-back images.
 
-    They come from the units that both explain. As in the estimate of a single direction, no channel can outvote all
-    others.
+    The first ones come from the units that both explain, the second ones from those that `near` explains. As in the
+    estimate of a single direction, no channel can outvote all others.
     """
     grid = angles.grid()
     towards = np.flatnonzero(near & (angles.in_front(grid - yaw) == angles.in_front(grid[peak] - yaw)))
     behind = np.array([_place(180.0 - azimuth + 2 * yaw) for azimuth in grid[towards]])
     both = np.concatenate((towards, behind))
-    part = mixture.part_of(near | np.isin(np.arange(len(near)), behind))
-    evidence = units.weighted[:, both] * part[:, np.newaxis]
-    scores = fuse(np.stack([np.bincount(units.channels, column) for column in evidence.T], axis=1))
-    front, back = np.logaddexp.reduce(scores.reshape(2, -1), axis=1)
-    return float(front - back)
+    odds = []
+    for explained in (near | np.isin(np.arange(len(near)), behind), near):
+        evidence = units.weighted[:, both] * mixture.part_of(explained)[:, np.newaxis]
+        scores = fuse(np.stack([np.bincount(units.channels, column) for column in evidence.T], axis=1))
+        odds.append(float(np.subtract(*np.logaddexp.reduce(scores.reshape(2, -1), axis=1))))
+    return odds
 
 
 def _without_images(found: list[Candidate], evidence: NDArray[np.float32], yaw: float) -> list[Candidate]:
@@ -183,7 +185,7 @@ def _without_images(found: list[Candidate], evidence: NDArray[np.float32], yaw: 
             if _equal(evidence, candidate.azimuth, other.azimuth):
                 share, power = other.share + candidate.share, other.power + candidate.power
                 salience = (other.share * other.salience + candidate.share * candidate.salience) / share
-                kept[index] = Candidate(other.azimuth, share, power, salience, other.odds)
+                kept[index] = other._replace(share=share, power=power, salience=salience)
                 break
         else:
             kept.append(candidate)

@@ -26,7 +26,8 @@ _VELOCITY_STD = 15.0  # degrees/s, of a new track
 _ACCELERATION_STD = 8.0  # degrees/s per square root of a second
 _NEW_SHARE = 0.12  # of a candidate of a source that is not known yet; noise without a direction gives smaller peaks
 _IMAGE_WIDTH = 7.5  # degrees of lateral angle between a source and its image, at most
-_CLEAR_ODDS = 4.0  # log-odds of a candidate against its front-back image that decide
+_CLEAR_ODDS = 4.0  # log-odds of a candidate against its front-back image that decide,
+_CLEAR_OWN_ODDS = 10.0  # and of its own units
 _CLEAR_SECONDS = 2.0  # for which a decision holds
 _ODDS_RATE = 0.1  # of the mean log-odds of a track
 _BIRTH = -2.0  # log-odds of a new track
@@ -103,7 +104,7 @@ class Track:
         self.power = candidate.power
         self.last_time = time
         self.odds += _ODDS_RATE * (candidate.odds - self.odds)
-        if candidate.odds > _CLEAR_ODDS:
+        if candidate.odds > _CLEAR_ODDS or candidate.own_odds > _CLEAR_OWN_ODDS:
             self._clear_time = time
 
     def is_clear(self, time: float) -> bool:
