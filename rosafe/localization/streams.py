@@ -134,7 +134,7 @@ class SourceStreams:
         self._waiting: deque[NDArray[np.float32]] = deque()  # of the next frames
         self._dereverberator = Dereverberator(BINS)
         self._total = np.zeros((2, 2, BINS), np.complex128)
-        self._frames: deque[_Frame] = deque(maxlen=round(PAUSE * RATE / HOP))
+        self._frames: deque[_SourceFrame] = deque(maxlen=round(PAUSE * RATE / HOP))
         self._count = 0
         self._states: deque[_State] = deque()
         self._sources: dict[int, _Source] = {}
@@ -220,7 +220,7 @@ class SourceStreams:
         time = (self._begin(self._count) + 2 * HOP) / RATE
         state = self._state(time)
         place = state.yaw_at(time), state.azimuths(time)
-        self._frames.append(_Frame(self._count, spectrum, covariance, self._total, terms, *place))
+        self._frames.append(_SourceFrame(self._count, spectrum, covariance, self._total, terms, *place))
 
     def _begin(self, number: int) -> int:
         """Return the number of the first sample of a frame."""
@@ -233,7 +233,7 @@ class SourceStreams:
         if id_ not in newest.places:
             if source is None or source.has_ended:
                 return []
-            frames: Iterable[_Frame] = [newest]
+            frames: Iterable[_SourceFrame] = [newest]
         else:
             azimuth = newest.places[id_]
             earliest = -(self._begin(0) // HOP)  # the frame of the first sample
@@ -296,7 +296,7 @@ _NEVER = _Place(0.0, 0.0, -math.inf)
 _NONE = _State(-math.inf, {}, math.nan, 0.0)
 
 
-class _Frame(NamedTuple):
+class _SourceFrame(NamedTuple):
     """A frame of sound.
 
     Attributes
@@ -321,7 +321,7 @@ class _Frame(NamedTuple):
     yaw: float
     places: Mapping[int, float]
 
-    def with_source(self, id_: int, azimuth: float, yaw: float) -> _Frame:
+    def with_source(self, id_: int, azimuth: float, yaw: float) -> _SourceFrame:
         """Return the frame with the azimuth of another source, and with a direction of the head if it has none."""
         if id_ in self.places:
             return self
@@ -351,7 +351,7 @@ class _Masks:
     def reset(self) -> None:
         """Forget all sound."""
         self._levels = np.empty((0, len(self._bins)))  # of the last frames, dB
-        self._last: tuple[_Frame | None, dict[int, FloatArray]] = None, {}
+        self._last: tuple[_SourceFrame | None, dict[int, FloatArray]] = None, {}
 
     def terms(self, features: Mapping[str, FloatArray]) -> NDArray[np.float32]:
         """Return the log-likelihood ratios (F, C, A) of new frames for all directions."""
@@ -362,7 +362,7 @@ class _Masks:
         floors = [cues.floors(levels[max(0, end - WINDOW) : end]) for end in range(first, len(levels) + 1)]
         return self._model.unweighted_terms(*self._model.rows(found, np.array(floors).reshape(found.level.shape)))
 
-    def of(self, frame: _Frame) -> dict[int, FloatArray]:
+    def of(self, frame: _SourceFrame) -> dict[int, FloatArray]:
         """Return the masks (BINS,) of the sources of a frame.
 
         Sources at nearly equal lateral angles are not separated.
@@ -413,7 +413,7 @@ class _Source:
         """Whether all following samples are zero, unless it is present again."""
         return self._silent >= SIZE // HOP - 1
 
-    def process(self, id_: int, frame: _Frame, masks: _Masks) -> FloatArray:
+    def process(self, id_: int, frame: _SourceFrame, masks: _Masks) -> FloatArray:
         """Return the HOP samples that are complete with the next frame."""
         azimuths = frame.turned()
         self._sum = np.append(self._sum[HOP:], np.zeros(HOP))
