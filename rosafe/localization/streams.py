@@ -308,7 +308,7 @@ class _SourceFrame(NamedTuple):
     terms : ndarray of float32, (C, A)
         Log-likelihood ratios of all directions.
     yaw : float
-        Direction of the head, degrees; NaN if there are no tracks of this time.
+        Direction of the head, degrees; NaN before the first tracks.
     places : mapping
         The azimuths of the sources in the world, by id.
     """
