@@ -19,7 +19,7 @@ SIZE = 3 * HOP  # of a Fourier transform
 BINS = SIZE // 2 + 1
 KEPT = 0.986  # weight of the past in covariances, for each frame: 0.7 s
 _LOADING = 0.015  # of the noise, relative to the power of both ears
-_UNFILTERED = 0.05  # of the ear, so that the filter is that of the ear if there is no dominant direction
+_UNFILTERED = 0.05  # of the ear, so that the filter is that of the ear without a dominant direction
 _TINY = 1e-200
 # Its square, shifted by HOP, adds to 1.
 _WINDOW = np.sin(np.pi * (np.arange(SIZE) + 0.5) / SIZE) * np.sqrt(2 * HOP / SIZE)

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rosafe.dsp.dereverberation import Dereverberator
 from rosafe.dsp.framing import FrameGrid
@@ -130,10 +131,10 @@ class SourceStreams:
         self._masks.reset()
         self._sound = np.zeros((2, max(0, self._lead)))  # from the first sample of the next frame on
         self._skipped = max(0, -self._lead)  # samples until then
-        self._waiting: deque[_Rows] = deque()  # of the next frames
+        self._waiting: deque[NDArray[np.float32]] = deque()  # of the next frames
         self._dereverberator = Dereverberator(BINS)
         self._total = np.zeros((2, 2, BINS), np.complex128)
-        self._frames: deque[_Frame] = deque(maxlen=round(PAUSE * RATE / HOP))
+        self._frames: deque[_SourceFrame] = deque(maxlen=round(PAUSE * RATE / HOP))
         self._count = 0
         self._states: deque[_State] = deque()
         self._sources: dict[int, _Source] = {}
@@ -198,7 +199,7 @@ class SourceStreams:
         return [part for unit in self._resampler.process(samples) for part in self._process_unit(unit)]
 
     def _process_unit(self, unit: FloatArray) -> list[SourcePart]:
-        self._waiting += self._masks.rows(self._cues.process(unit))
+        self._waiting.extend(self._masks.terms(self._cues.process(unit)))
         self._sound = np.concatenate((self._sound, np.clip(unit, -_MAX_SAMPLE, _MAX_SAMPLE)), axis=1)
         skipped = min(self._skipped, self._sound.shape[1])
         self._sound, self._skipped = self._sound[:, skipped:], self._skipped - skipped
@@ -211,7 +212,7 @@ class SourceStreams:
             self._count += 1
         return [self._part(id_, frames) for id_, frames in sorted(found.items()) if frames]
 
-    def _add_frame(self, rows: _Rows) -> None:
+    def _add_frame(self, terms: NDArray[np.float32]) -> None:
         """Add the next frame to those that are kept."""
         spectrum = self._dereverberator.process(spatial_filter.spectrum(self._sound[:, :SIZE]))
         covariance = (1 - KEPT) * spatial_filter.covariance(spectrum)
@@ -219,7 +220,7 @@ class SourceStreams:
         time = (self._begin(self._count) + 2 * HOP) / RATE
         state = self._state(time)
         place = state.yaw_at(time), state.azimuths(time)
-        self._frames.append(_Frame(self._count, spectrum, covariance, self._total, rows, *place))
+        self._frames.append(_SourceFrame(self._count, spectrum, covariance, self._total, terms, *place))
 
     def _begin(self, number: int) -> int:
         """Return the number of the first sample of a frame."""
@@ -232,7 +233,7 @@ class SourceStreams:
         if id_ not in newest.places:
             if source is None or source.has_ended:
                 return []
-            frames: Iterable[_Frame] = [newest]
+            frames: Iterable[_SourceFrame] = [newest]
         else:
             azimuth = newest.places[id_]
             earliest = -(self._begin(0) // HOP)  # the frame of the first sample
@@ -295,14 +296,7 @@ _NEVER = _Place(0.0, 0.0, -math.inf)
 _NONE = _State(-math.inf, {}, math.nan, 0.0)
 
 
-class _Rows(NamedTuple):
-    """The rows (1, C) of a frame in the tables of the model."""
-
-    itd: np.ndarray
-    ild: np.ndarray
-
-
-class _Frame(NamedTuple):
+class _SourceFrame(NamedTuple):
     """A frame of sound.
 
     Attributes
@@ -311,9 +305,10 @@ class _Frame(NamedTuple):
     spectrum : ndarray, (2, BINS)
     covariance, total : ndarray, (2, 2, BINS)
         The part of the frame in the mean over the past, and this mean.
-    rows : _Rows
+    terms : ndarray of float32, (C, A)
+        Log-likelihood ratios of all directions.
     yaw : float
-        Direction of the head, degrees; NaN if there are no tracks of this time.
+        Direction of the head, degrees; NaN before the first tracks.
     places : mapping
         The azimuths of the sources in the world, by id.
     """
@@ -322,11 +317,11 @@ class _Frame(NamedTuple):
     spectrum: ComplexArray
     covariance: ComplexArray
     total: ComplexArray
-    rows: _Rows
+    terms: NDArray[np.float32]
     yaw: float
     places: Mapping[int, float]
 
-    def with_source(self, id_: int, azimuth: float, yaw: float) -> _Frame:
+    def with_source(self, id_: int, azimuth: float, yaw: float) -> _SourceFrame:
         """Return the frame with the azimuth of another source, and with a direction of the head if it has none."""
         if id_ in self.places:
             return self
@@ -356,25 +351,18 @@ class _Masks:
     def reset(self) -> None:
         """Forget all sound."""
         self._levels = np.empty((0, len(self._bins)))  # of the last frames, dB
-        self._last: tuple[_Frame | None, dict[int, FloatArray]] = None, {}
+        self._last: tuple[_SourceFrame | None, dict[int, FloatArray]] = None, {}
 
-    def rows(self, features: Mapping[str, FloatArray]) -> list[_Rows]:
-        """Return the rows of new frames."""
+    def terms(self, features: Mapping[str, FloatArray]) -> NDArray[np.float32]:
+        """Return the log-likelihood ratios (F, C, A) of new frames for all directions."""
         found = cues.quantize(features, cues.scaling_db(self._model.parameters), self._model.max_itd)
         levels = np.concatenate((self._levels, found.level))
         self._levels = levels[1 - WINDOW :]
         first = len(levels) - len(found.level) + 1
-        return [
-            _Rows(
-                *self._model.rows(
-                    found.select(slice(number, number + 1)),
-                    cues.floors(levels[max(0, first + number - WINDOW) : first + number]),
-                )
-            )
-            for number in range(len(found.level))
-        ]
+        floors = [cues.floors(levels[max(0, end - WINDOW) : end]) for end in range(first, len(levels) + 1)]
+        return self._model.unweighted_terms(*self._model.rows(found, np.array(floors).reshape(found.level.shape)))
 
-    def of(self, frame: _Frame) -> dict[int, FloatArray]:
+    def of(self, frame: _SourceFrame) -> dict[int, FloatArray]:
         """Return the masks (BINS,) of the sources of a frame.
 
         Sources at nearly equal lateral angles are not separated.
@@ -382,8 +370,7 @@ class _Masks:
         if self._last[0] is frame:
             return self._last[1]
         azimuths = frame.turned()
-        terms = self._model.unweighted_terms(*frame.rows)[0]
-        likelihood = np.exp(terms - terms.max(axis=-1, keepdims=True), dtype=np.float64)
+        likelihood = np.exp(frame.terms - frame.terms.max(axis=-1, keepdims=True), dtype=np.float64)
         laterals = angles.lateral(np.array(list(azimuths.values())))
         distance = np.abs(self._lateral - laterals[:, np.newaxis])
         wanted, diffuse = (
@@ -426,7 +413,7 @@ class _Source:
         """Whether all following samples are zero, unless it is present again."""
         return self._silent >= SIZE // HOP - 1
 
-    def process(self, id_: int, frame: _Frame, masks: _Masks) -> FloatArray:
+    def process(self, id_: int, frame: _SourceFrame, masks: _Masks) -> FloatArray:
         """Return the HOP samples that are complete with the next frame."""
         azimuths = frame.turned()
         self._sum = np.append(self._sum[HOP:], np.zeros(HOP))

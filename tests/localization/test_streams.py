@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from rosafe.commands.__main__ import main
 from rosafe.dsp.resampler import Resampler
 from rosafe.localization import speech
 from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.filters import HOP, SourceRenderer
 from rosafe.localization.head import Head
 from rosafe.localization.mixture import Candidate
 from rosafe.localization.streams import RATE, SourcePart, SourceStreams
@@ -129,6 +131,33 @@ def test_a_source_has_no_gaps_and_no_clicks_and_keeps_its_numbers_after_a_pause(
     # a click would have energy far from the tone
     rest = scipy.signal.sosfilt(scipy.signal.butter(6, 2000, "high", fs=RATE, output="sos"), sound)
     assert np.abs(rest).max() < 0.002
+
+
+def test_a_voice_that_crosses_another_one_keeps_its_id(kemar: Head, model: DirectionModel) -> None:
+    """A talker moves from the right to the left, past another one."""
+    paths = sorted(RECORDINGS.glob("*_*.wav"))
+    if not paths:
+        pytest.skip("Debian's alsa-utils is not installed")
+    voice = np.concatenate([scipy.signal.resample_poly(one, RATE, rate) for one, rate in map(soundfile.read, paths)])
+    dry = 0.03 * np.resize(voice[np.abs(scipy.signal.lfilter([0.01], [1, -0.99], np.abs(voice))) > 0.01], 8 * RATE)
+    azimuths = np.linspace(-50, 70, len(dry) // HOP + 1)
+    truths = (
+        SourceRenderer(kemar.filters(RATE)).process(dry, azimuths),
+        kemar.render(np.roll(dry, 2 * RATE), RATE, 0.0),
+    )
+    with warnings.catch_warnings(action="ignore"):  # of a missing detector
+        tracks = rosafe.localize(sum(truths), RATE, model, streams=True)["tracks"]  # type: ignore[arg-type]
+    tracks = sorted(tracks, key=lambda one: len(one["stream"]))[-2:]
+    orders = []
+    for part in (slice(RATE, 3 * RATE), slice(-2 * RATE, -RATE // 2)):
+        likeness = np.empty((2, 2))
+        for row, one in enumerate(tracks):
+            sound = np.zeros(len(dry))
+            sound[round(one["stream_time"] * RATE) :][: len(one["stream"])] = one["stream"]
+            likeness[row] = [max(np.corrcoef(sound[part], ear[part])[0, 1] for ear in truth) for truth in truths]
+        orders.append(likeness.argmax(axis=1).tolist())
+        assert np.all(likeness.max(axis=1) - likeness.min(axis=1) > 0.3), likeness
+    assert orders[0] == orders[1] and sorted(orders[0]) == [0, 1]
 
 
 def test_sources_that_cross_are_not_cut(kemar: Head, model: DirectionModel) -> None:
