@@ -117,7 +117,7 @@ def test_sources_come_and_go_and_a_slow_and_a_late_subscriber(
         [m.id for m in messages if abs(math.degrees(m.azimuth) - azimuth) < 10][-1] for azimuth in (TALKER, MUSIC)
     )
     begins = {}
-    for id_, truth, begin, end in ((talker, parts[0], 0.0, 3.0), (tune, parts[1], 2.5, SECONDS)):
+    for id_, truth, begin, end in ((talker, parts[0], 0.0, 3.0), (tune, parts[1], 2.5, 6.0)):
         own = [m for m in messages if m.id == id_]
         stream = np.zeros(own[-1].first_sample + len(own[-1].samples))  # with zeros in pauses
         for message in own:
