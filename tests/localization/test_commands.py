@@ -167,7 +167,8 @@ def test_a_model_of_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert DirectionModel.load(target).sample_rate == RATE
     found = rosafe.localize(head.render(modulated(1.0, 3), RATE, 45), RATE, target)
     assert min(abs(found["azimuth"][-1] - 45), abs(found["azimuth"][-1] - 135)) <= 5
-    tables = recordings._interpolated(np.arange(24.0)[np.newaxis], np.arange(-180.0, 180.0, 15.0))
+    tables = recordings._interpolated(np.arange(25.0)[np.newaxis], np.arange(-180.0, 180.0, 15.0))
     assert np.allclose(tables[0, :5], np.arange(1, 6) / 3)  # of -175, -170 ... -155 degrees
+    assert tables.shape == (1, 73) and tables[0, -1] == 24  # of reverberation
     table.write_text("file,azimuth_deg\n0.wav,0\n90.wav,90\n")
     assert main(["head", "learn", str(table), "-o", str(target), "--force"]) == 1
