@@ -241,6 +241,9 @@ sources:
 
 
 @pytest.mark.exploration
+@pytest.mark.xfail(
+    reason="the node has tracks of both talkers for 0.43 of the time, rosafe.localize for 0.69: not explained"
+)
 def test_two_talkers_and_a_turning_head(
     graph: Graph, afe: Process, kemar_model: Path, talker: Path, other_talker: Path, tmp_path: Path
 ) -> None:
