@@ -1,7 +1,7 @@
 """Run both nodes on a private ROS master for some seconds, and save a figure of the sound and its directions.
 
-It does what `rosafe up`, a recording of all ports, `rosafe localize` and `rosafe plot` do, and prints the number of
-messages, lost frames and the direction of the source. No running master or node is used."""
+The nodes are started as by `rosafe up`. All ports are recorded, and the directions come from the recorded sound. The
+numbers of messages and lost frames and the direction of the source are printed. No running master or node is used."""
 
 from __future__ import annotations
 
@@ -230,7 +230,7 @@ async def _follow(
 
 
 async def _reach(launcher: Launcher, ports: Mapping[str, Port], wanted: int) -> int:
-    """Wait until all ports have so many audio frames, or no new ones arrive; return their number."""
+    """Wait until all ports have `wanted` audio frames, or no new ones arrive; return the number that all have."""
     reached, moved = 0, time.monotonic()
     while reached < wanted and time.monotonic() < moved + (SILENT_SECONDS if reached else FIRST_SECONDS):
         await asyncio.sleep(0.02)

@@ -95,7 +95,7 @@ class DirectionModel:
     Parameters
     ----------
     description : mapping
-        The attributes above, but for the directions and tables.
+        The attributes above without the directions and the tables.
     itd_table, ild_table : ndarray, (rows + 1, A + 1)
         The tables with a last column for reverberation.
     """
