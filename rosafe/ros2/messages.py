@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import array
+import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
 
 MAX_SECONDS = 2**31 - 1  # since 1970, of a time of ROS 2
 
@@ -17,6 +19,12 @@ def ros_time(seconds: float) -> Time:
     """Return a time in s as a time of ROS; 0 for a negative one."""
     whole, nanoseconds = divmod(max(0, round(seconds * 1e9)), 1_000_000_000)
     return Time(sec=min(whole, MAX_SECONDS), nanosec=nanoseconds)
+
+
+def clock_offset(node: Node) -> float:
+    """Return by how much the clock of a node is ahead of the system's (s); it is with `use_sim_time`."""
+    clock = node.get_clock()
+    return clock.now().nanoseconds / 1e9 - time.time() if clock.ros_time_is_active else 0.0
 
 
 def numbers(values: Any) -> array.array[float]:

@@ -48,7 +48,7 @@ from rosafe.localization.status import NodeStatus
 from rosafe.representations import PROBLEMS, WARNINGS
 from rosafe.ros2 import transforms
 from rosafe.ros2.localization import Localization, SourcePublishers
-from rosafe.ros2.messages import diagnostics
+from rosafe.ros2.messages import clock_offset, diagnostics
 from rosafe.ros2.node_tree import NodeTree
 from rosafe.ros2.outputs import Outputs, topics_of
 from rosafe.ros2.parameters import ProcessorParameters
@@ -105,7 +105,7 @@ class RosafeNode:
             log.warning(f"plugin {remark}")
         frames = self._values["world_frame"] or WORLD, self._values["frame_id"]
         truth = transforms.TruthTopics(self.node, frames, self.now)
-        self.sound = Sound(self.now, log, truth.publish, functools.partial(open_device, self.node))
+        self.sound = Sound(functools.partial(clock_offset, self.node), log, truth.publish, functools.partial(open_device, self.node))
         changed = self.node.create_guard_condition(self._update)
         outputs = Outputs(self.node, self.sound, changed.trigger)
         self.tree = NodeTree(outputs, self.sound, self._values["frames_per_block"], TOPICS, log)

@@ -93,8 +93,8 @@ class Sound:
 
     Parameters
     ----------
-    now : callable
-        Returns the clock time of the node in s; it differs from the system's with `use_sim_time`.
+    clock_offset : callable
+        Returns by how much the clock of the node is ahead of the system's (s); it is with `use_sim_time`.
     log : object
         With `info`, `warning` and `error`.
     publish_truth : callable
@@ -113,12 +113,12 @@ class Sound:
 
     def __init__(
         self,
-        now: Callable[[], float],
+        clock_offset: Callable[[], float],
         log: Any,
         publish_truth: Callable[[int, float, Any], object],
         open_device: OpenSource,
     ) -> None:
-        self._now, self._log = now, log
+        self._clock_offset, self._log = clock_offset, log
         self._report = ThrottledLog(log.warning)
         self._publish_truth, self._open_device = publish_truth, open_device
         self.ring = AudioRing(self._report)
@@ -220,15 +220,13 @@ class Sound:
             (self._log.error if level == ERROR else self._log.info)(text)
 
     def _receive(self, new: Snapshot) -> None:
-        """Give a chunk to the ring, with the clock time of the node."""
-        # The clock of a simulation is 0 before it begins, but the ring takes a stamp of 0 as unknown
-        seconds = max(1e-9, self.clock_time(new.time_ns / 1e9)) if new.time_ns else 0.0
+        """Give a chunk to the ring."""
         index = new.last_frame_index
-        stamp = {"sec": 0, "nsec": 1e9 * seconds}
+        stamp = {"sec": 0, "nsec": new.time_ns}
         window = _Window(new.sample_rate, 1, new.frames_per_chunk, index, new.left, new.right, stamp)
         if new.time_ns:
             known = self.ring.captured(index) if index > new.frames_per_chunk else None
-            self._line = known or LinearClock(index, seconds, new.sample_rate)
+            self._line = known or LinearClock(index, new.time_ns / 1e9, new.sample_rate)
         for feed in (self._feed, *self._other_feeds):
             feed(window)
 
@@ -243,10 +241,6 @@ class Sound:
                 feed(_Window(rate, 1, count, frames.newest, left, right, {"sec": 0, "nsec": 0}))
             self._other_feeds.append(feed)
         return functools.partial(self._other_feeds.remove, feed)
-
-    def clock_time(self, seconds: float) -> float:
-        """Return the clock time of the node for a time of the system's clock (s)."""
-        return seconds + self._now() - time.time()
 
     # --- for the tree ---
 
@@ -264,8 +258,12 @@ class Sound:
                 self.reader = before
 
     def time_of(self, frame: float) -> float:
-        """Return the clock time (s) at which an audio frame, of which the first is 1, was captured; 0 if unknown."""
-        return 0.0 if self._line is None else self._line.at(frame)
+        """Return the clock time (s) at which an audio frame, of which the first is 1, was captured; 0 if unknown.
+
+        The clock of a simulation may be slow or stand still, so that no line fits its times: sound has those of the
+        system's clock, and the difference of both clocks is added last.
+        """
+        return 0.0 if self._line is None else max(0.0, self._line.at(frame) + self._clock_offset())
 
     def report(self, status: Any) -> None:
         """Fill in a status of /diagnostics."""

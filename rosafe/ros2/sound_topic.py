@@ -12,6 +12,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosafe.audio.devices import SoundSource, open_source
 from rosafe.audio.devices.base import device_error
 from rosafe.audio.devices.received import ReceivedSource
+from rosafe.ros2.messages import clock_offset
 
 PREFIX = "topic:"
 INFO = "audio_info"  # the topic beside that of the sound that describes its format
@@ -67,7 +68,10 @@ class TopicSource(ReceivedSource):
 
     def _receive_stamped(self, message: Any, info: Any) -> None:
         stamp = message.header.stamp
-        self.receive(message.audio.data, stamp.sec * 1_000_000_000 + stamp.nanosec, _number(info))
+        time_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+        if time_ns:  # 0 is unknown
+            time_ns -= round(1e9 * clock_offset(self._node))
+        self.receive(message.audio.data, time_ns, _number(info))
 
     def close(self) -> None:
         """Unsubscribe."""

@@ -80,6 +80,18 @@ def test_the_line_is_never_later_than_a_stamp(seconds: int) -> None:
         assert times._fit().at(frames[-1] + step) < BEGIN + (frames[-1] + step) / 1000 + 0.0201 - 0.003 * step
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.5, 0.99])
+def test_a_clock_that_is_slower_than_the_sound(speed: float) -> None:
+    """The clock of a simulation: the line, which can hardly change its rate, begins anew."""
+    times = FrameTime()
+    times.begin(16000)
+    for frame in range(800, 20 * 16000, 800):
+        clock = BEGIN + speed * frame / 16000
+        times.add(frame, clock)
+        line = times.line(frame)
+        assert line is not None and abs(line.time - clock) < 0.052
+
+
 def test_a_clock_that_is_set_and_a_restarted_stream() -> None:
     times = FrameTime()
     times.begin(1000)
