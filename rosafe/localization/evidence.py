@@ -105,9 +105,11 @@ class EvidenceWindow:
         """Return the evidence (C, A) of each channel, summed over the frames, in world coordinates."""
         return self._sums
 
-    def level(self, frames: int) -> FloatArray:
-        """Return the mean level (C,) of the last `frames` frames in dB."""
-        return np.asarray(10 * np.log10(self._powers[self._last(frames)].mean(axis=0)))
+    def lowest_level(self, frames: int) -> FloatArray:
+        """Return the lowest of the mean levels (C,) of the `frames` frames up to each of the last `frames` ones, in dB."""
+        powers = self._powers[self._last(2 * frames - 1)]
+        means = sliding_window_view(powers, min(frames, len(powers)), axis=0).mean(axis=-1)
+        return np.asarray(10 * np.log10(means.min(axis=0)))
 
     def _last(self, frames: int) -> NDArray[np.intp]:
         """Return the places of the last `frames` frames, of fewer if there are fewer."""

@@ -230,7 +230,7 @@ class Localizer(OwnState):
 
     def _update_tracks(self, time: float, yaw: float) -> None:
         window = self._evidence
-        self.noise.update(window.level(self._update_frames))
+        self.noise.update(window.lowest_level(self._update_frames))
         found = candidates(window.units(self._track_frames, self.noise.threshold), yaw)
         found = self.noise.remove_from(found, time, yaw)
         self._tracker.update(found, time, yaw)

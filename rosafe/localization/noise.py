@@ -62,7 +62,7 @@ class SteadyNoise:
         self._tracker = Tracker(keep=False)  # of all candidates: shows which ones move
 
     def update(self, level: FloatArray) -> None:
-        """Add the mean level (C,) of the last 0.1 s in dB."""
+        """Add the lowest mean level (C,) of 0.1 s, of those that end in the last 0.1 s, in dB."""
         self._levels.append(level)
 
     def reset(self, keep_levels: bool = False) -> None:

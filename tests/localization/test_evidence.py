@@ -93,3 +93,16 @@ def test_reverberation_does_not_change_the_tables_of_directions() -> None:
     for table, without in zip(histograms.tables(frequencies), before, strict=True):
         np.testing.assert_array_equal(table[:, :-1], without[:, :-1])
         assert np.abs(table[:-1, -1]).mean() > 0.01
+
+
+@pytest.mark.parametrize("phase", range(10))
+def test_the_lowest_level_is_found_at_any_phase(model: DirectionModel, phase: int) -> None:
+    """A pause of 10 frames counts whole, however the updates after every 10 frames lie."""
+    cues, window = random_cues(), EvidenceWindow(model, LENGTH)
+    cues = cues._replace(level=np.tile(np.repeat([-20.0, -25.0, -60.0, -22.0], 10)[:, np.newaxis], (1, CHANNELS)))
+    found = []
+    for begin in range(phase, 31, 10):
+        part = slice(begin, begin + 10)
+        window.extend(cues.select(part), np.zeros(len(cues.level[part])), np.zeros(len(cues.level[part])))
+        found.append(window.lowest_level(10))
+    assert np.min(found, axis=0) == pytest.approx(-60.0)

@@ -241,7 +241,6 @@ sources:
 
 
 @pytest.mark.exploration
-@pytest.mark.xfail(reason="both tracks depend on the phase of the updates, which the node and the file do not share")
 def test_two_talkers_and_a_turning_head(
     graph: Graph, afe: Process, kemar_model: Path, talker: Path, other_talker: Path, tmp_path: Path
 ) -> None:
