@@ -21,6 +21,7 @@ BLOCK_SECONDS = UNIT / RATE  # of sound that is read together
 _WAIT = 0.1  # s between two checks whether there are subscribers
 _STEP = 0.05  # s after the last update of the tracks, when there are none any more
 _PAUSE = 1.0  # s after an error
+_SET = 0.05  # s, of a step in the times of the sound: the clock has been set
 
 
 class SoundBlock(NamedTuple):
@@ -143,6 +144,7 @@ class LiveStreams:
         """Publish the parts of all sources while there are subscribers."""
         rate = opened[0].sample_rate
         begin, end = 0, -1  # numbers of samples: where the streams began, and after the last block
+        start = math.inf  # clock time of the sample `begin`
         checked = 0.0
         while not self._ended.is_set() and self._open is opened:
             if time.monotonic() - checked > _WAIT:
@@ -153,12 +155,12 @@ class LiveStreams:
             if block is None:
                 continue
             samples = block.samples
-            if block.first != end:
+            if block.first != end or abs(block.time - (block.first - begin) / rate - start) > _SET:
                 begin = _on_grid(block.first, rate)
                 samples = samples[:, begin - block.first :]
                 streams.reset()
             end = block.first + block.samples.shape[1]
-            start = block.time - (block.first - begin) / rate  # clock time of the sample `begin`
+            start = block.time - (block.first - begin) / rate
             with self._lock:
                 updates, self._updates = self._updates, []
             for moment, tracks, yaw in updates:

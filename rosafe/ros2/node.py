@@ -105,7 +105,9 @@ class RosafeNode:
             log.warning(f"plugin {remark}")
         frames = self._values["world_frame"] or WORLD, self._values["frame_id"]
         truth = transforms.TruthTopics(self.node, frames, self.now)
-        self.sound = Sound(functools.partial(clock_offset, self.node), log, truth.publish, functools.partial(open_device, self.node))
+        self.sound = Sound(
+            functools.partial(clock_offset, self.node), log, truth.publish, functools.partial(open_device, self.node)
+        )
         changed = self.node.create_guard_condition(self._update)
         outputs = Outputs(self.node, self.sound, changed.trigger)
         self.tree = NodeTree(outputs, self.sound, self._values["frames_per_block"], TOPICS, log)

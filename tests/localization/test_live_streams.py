@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from rosafe.audio.stream.ring import AudioRing
+from rosafe.audio.stream.ring_sound import RingSound
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.head import Head
 from rosafe.localization.live_streams import LiveStreams, SoundBlock
@@ -130,3 +134,50 @@ def test_sound_is_read_for_subscribers_only(session: Session, sphere_model: Path
     wait_for(lambda: len(opened) == 2, what="another subscription")
     session.streams.connect(None)
     wait_for(opened[1].closed.is_set, what="the end of the sound")
+
+
+def test_the_first_times_are_those_of_another_stream(session: Session, sphere_model: Path, ears: np.ndarray) -> None:
+    """Updates that were placed by them do not hide later ones."""
+    sound = Sound(ears)
+    blocks = [block._replace(time=block.time - 10 * (block.first < 1000)) for block in sound._blocks]
+    sound._blocks = iter(blocks)
+    session.streams.connect(DirectionModel.load(sphere_model), lambda: sound)
+    session.streams.update(CLOCK, [], 0.0)
+    read = sound.read
+
+    def read_and_update(seconds: float) -> SoundBlock | None:
+        block = read(seconds)
+        if block is not None:
+            session.streams.update(CLOCK + block.first / RATE, [track(1, 40.0)], 0.0)
+        return block
+
+    sound.read = read_and_update  # type: ignore[method-assign]
+    session.streams.start()
+    wait_for(lambda: len(session.parts) > 20, what=lambda: f"parts: {session.status.lines}")
+    assert session.parts[0][1] < CLOCK + 0.2
+
+
+def test_a_block_without_a_time_is_kept() -> None:
+    ring = AudioRing(lambda line: None)
+    known = []
+
+    def time_of(frame: int) -> float:
+        if not known:
+            raise LookupError
+        return CLOCK + frame / RATE
+
+    window = SimpleNamespace(sampleRate=RATE, nChunksOnPort=1, nFramesPerChunk=320, stamp={"sec": 0, "nsec": 0})
+    with contextlib.closing(RingSound(ring, RATE, time_of)) as sound:
+        feed = ring.connect()
+
+        def fill(block: int) -> None:
+            window.left = window.right = np.full(320, block, np.int32)
+            window.lastFrameIndex = 320 * (block + 1)
+            feed(window)
+
+        fill(0)
+        assert [sound.read(0.01) for _ in range(3)] == [None] * 3
+        fill(1)
+        known.append(True)
+        blocks = [wait_for(lambda: sound.read(0.01)) for _ in range(2)]
+    assert [(block.first, block.samples[0, 0]) for block in blocks if block] == [(0, 0), (320, 1)]

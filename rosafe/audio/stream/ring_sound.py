@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
+import numpy as np
+
 from rosafe.audio.stream.ring import AudioReader, AudioRing
 from rosafe.localization.live import Status
 from rosafe.localization.live_streams import BLOCK_SECONDS, SoundBlock
@@ -26,20 +28,13 @@ class RingSound:
     sample_rate : float
         Hz; sound at another rate is not read.
     time_of : callable
-        Returns the clock time (s) of a frame, of which the first is 1; LookupError if it is not known.
-    is_known : callable
-        Waits for some seconds until times are known, and returns whether they are.
+        Returns the clock time (s) of a frame, of which the first is 1; LookupError if it is not known yet.
     """
 
-    def __init__(
-        self,
-        ring: AudioRing,
-        sample_rate: float,
-        time_of: Callable[[int], float],
-        is_known: Callable[[float], bool] = lambda _: True,
-    ) -> None:
-        self._ring, self._rate, self._time_of, self._is_known = ring, sample_rate, time_of, is_known
+    def __init__(self, ring: AudioRing, sample_rate: float, time_of: Callable[[int], float]) -> None:
+        self._ring, self._rate, self._time_of = ring, sample_rate, time_of
         self._reader: AudioReader | None = None
+        self._kept: tuple[np.ndarray, int] | None = None  # a block whose time is not known yet
         self._arrived = threading.Event()
 
     def close(self) -> None:
@@ -61,17 +56,16 @@ class RingSound:
             reader.open(self._arrived.set)
             with ring.lock:
                 reader.begin(max(ring.frames.oldest, reader.position - round(BEFORE_SECONDS * self._rate)))
-        if not self._is_known(seconds):  # no frame is skipped: streams are those of a file
-            return None
-        if self._reader.waiting:
+        if self._kept is not None or self._reader.waiting:
             self._arrived.wait(seconds)
         self._arrived.clear()
-        block = self._reader.read()
+        block, self._kept = self._kept or self._reader.read(), None
         if block is None:
             return None
         samples, end = block  # frames are numbered from 1
         try:
             time = self._time_of(end - samples.shape[1])
-        except LookupError:  # of the first frames
+        except LookupError:
+            self._kept = block  # no frame is skipped: streams are those of a file
             return None
         return SoundBlock(samples, end - samples.shape[1] - 1, time)

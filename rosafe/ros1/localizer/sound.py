@@ -7,6 +7,8 @@ from rosafe.localization.live import Status
 from rosafe.ros import FrameClock
 from rosafe.ros1.afe.audio_input import AudioInput
 
+_CURRENT = 2.0  # s, at most, between the newest sound and the newest time of the same stream
+
 
 class InputSound(RingSound):
     """A `LiveSound`, subscribed to the topic of the input.
@@ -25,7 +27,16 @@ class InputSound(RingSound):
     def __init__(self, topic: str, sample_rate: float, clock: FrameClock, status: Status) -> None:
         self._input = AudioInput(loss_report(status))
         self._input.connect(topic)
-        super().__init__(self._input.ring, sample_rate, lambda frame: float(clock.time(frame).ros.to_sec()), clock.wait)
+        self._clock = clock
+        super().__init__(self._input.ring, sample_rate, self._time)
+
+    def _time(self, frame: int) -> float:
+        """Return the clock time of a frame (s); LookupError if times of another stream have arrived last."""
+        with self._ring.lock:
+            newest = self._ring.frames.newest
+        if not self._clock.covers(newest, _CURRENT * self._rate):
+            raise LookupError
+        return float(self._clock.time(frame).ros.to_sec())
 
     def close(self) -> None:
         """Unsubscribe."""

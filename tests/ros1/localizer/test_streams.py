@@ -145,7 +145,7 @@ def test_sound_of_another_rate_is_not_read_and_frames_count_from_0(graph: Graph,
     numbers = np.arange(3 * RATE) / 2.0**20  # of the samples, from 0
     soundfile.write(path, np.stack((numbers, numbers), axis=1), RATE, subtype="PCM_32")
     moment = SimpleNamespace(ros=rospy.Time(1))
-    clock: Any = SimpleNamespace(time=lambda frame: moment, wait=lambda seconds: True)
+    clock: Any = SimpleNamespace(time=lambda frame: moment, covers=lambda frame, within: True)
     graph.client()
     with (
         contextlib.closing(InputSound("/bass/Audio", float(RATE), clock, cast(Any, None))) as sound,
