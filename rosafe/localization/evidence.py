@@ -106,7 +106,7 @@ class EvidenceWindow:
         return self._sums
 
     def lowest_level(self, frames: int) -> FloatArray:
-        """Return the lowest of the mean levels (C,) of the `frames` frames up to each of the last `frames` ones, in dB."""
+        """Return the lowest mean level (C,) of `frames` frames in dB, of those that end in the last `frames` ones."""
         powers = self._powers[self._last(2 * frames - 1)]
         means = sliding_window_view(powers, min(frames, len(powers)), axis=0).mean(axis=-1)
         return np.asarray(10 * np.log10(means.min(axis=0)))

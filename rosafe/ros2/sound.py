@@ -43,7 +43,7 @@ class _Window(NamedTuple):
     lastFrameIndex: int
     left: np.ndarray
     right: np.ndarray
-    stamp: dict[str, float]
+    stamp: dict[str, int]
 
 
 class BlockReader:

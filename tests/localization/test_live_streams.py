@@ -159,7 +159,7 @@ def test_the_first_times_are_those_of_another_stream(session: Session, sphere_mo
 
 def test_a_block_without_a_time_is_kept() -> None:
     ring = AudioRing(lambda line: None)
-    known = []
+    known: list[bool] = []
 
     def time_of(frame: int) -> float:
         if not known:

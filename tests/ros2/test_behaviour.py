@@ -81,7 +81,7 @@ def test_stamps_are_times_of_the_clock_of_a_simulation(ros2: Network, tmp_path: 
     ros2.node("device:=scene:", "representations:=[ild]", "use_sim_time:=true")
     client = Client(ros2, tmp_path)
     client.subscribe("ild")
-    newest = wait_for(lambda: next((one for one in client.take("ild") if one["first_frame"] > 300), None))  # 3 s
+    newest: Any = wait_for(lambda: next((one for one in client.take("ild") if one["first_frame"] > 300), None))  # 3 s
     assert newest["header"]["stamp"] == {"sec": 0, "nanosec": 0}, "the clock has not begun"
     clock = {"clock": {"sec": 1000, "nanosec": 0}}
 
