@@ -124,6 +124,25 @@ def test_lost_messages_by_stamps(source: ReceivedSource) -> None:
     assert (source.overruns, source.lost_frames) == (3, 28 * LENGTH)
 
 
+@pytest.mark.parametrize("jitter", [0.0, 0.0005, 0.003])  # s; messages of 5 and 10 ms
+def test_random_losses_are_found_where_they_are(jitter: float) -> None:
+    """Also at the beginning, when the jitter is not known, and in short succession."""
+    for seed in range(24):
+        random = np.random.default_rng(seed)
+        signal = noise(400 * LENGTH, seed=seed)
+        source = opened()
+        driver = Driver(source, signal, LENGTH // 2 if seed % 2 else LENGTH)
+        expected = signal.copy()
+        while driver.number * driver.length < 380 * LENGTH:
+            if driver.number > 150 and random.random() < 0.02:
+                lost = int(random.integers(1, 8))
+                expected[driver.number * driver.length :][: lost * driver.length] = 0
+                driver.lose(lost)
+            driver.send(late=lambda _: random.uniform(0, jitter), numbered=seed % 3 == 0)  # noqa: B023
+        driver.send(5)
+        assert np.array_equal(read(source), expected[: driver.number * driver.length].T), seed
+
+
 def test_overruns_of_the_driver_are_no_whole_messages(source: ReceivedSource) -> None:
     signal = noise(100 * LENGTH)
     driver = Driver(source, signal)

@@ -128,8 +128,10 @@ class MessageOrder:
     CONFIRM_MESSAGES = 2  # that have to show the same loss
     CONFIRM_JITTERS = 20.0  # additional time for that, in units of the jitter
     UNBROKEN_SECONDS = 1.0  # the same for messages that are complete by their numbers
-    JITTER_SECONDS = 2.0  # time constant with which the jitter is forgotten
+    JITTER_SECONDS = 2.0  # time constant with which the jitter is forgotten; at the beginning,
+    FIRST_JITTER_SECONDS = 0.1  # when it is only assumed, it is shorter
     MAX_JITTER = 0.05  # s
+    LARGE_JITTER = 1.5  # in units of the jitter, whose largest value is partly forgotten
     MAX_HELD = 1024  # messages
     DRIFT = 5e-4  # s per s, of the sample clock against the clock of the stamps
     LONGEST_TOLERANCE = 0.25  # s
@@ -171,7 +173,8 @@ class MessageOrder:
     def _place(self, gap: int) -> tuple[int, Received]:
         message = self._held.pop(0)
         self._end += gap + message.frames
-        self._jitter *= 1 - min(0.5, message.frames / self._rate / self.JITTER_SECONDS)
+        seconds = min(self.JITTER_SECONDS, self.FIRST_JITTER_SECONDS + self._end / self._rate)
+        self._jitter *= 1 - min(0.5, message.frames / self._rate / seconds)
         self._length = message.frames
         return gap, message
 
@@ -232,8 +235,11 @@ class MessageOrder:
         if self._held[0].skipped == 0:
             seconds = max(seconds, self.UNBROKEN_SECONDS)
         shown = self._held[-1].start - self._held[since].start
-        if final or (shown >= seconds and len(late) - since > self.CONFIRM_MESSAGES):
+        if shown >= seconds and len(late) - since > self.CONFIRM_MESSAGES:
             return self._lost(self._held[0], math.copysign(least, late[since]), length)
+        if final:
+            lost = least > self.LARGE_JITTER * self._jitter
+            return self._lost(self._held[0], math.copysign(least, late[since]), length) if lost else 0
         return None
 
     def _lost(self, first: Received, late: float, length: int) -> int:
@@ -248,9 +254,11 @@ class MessageOrder:
             raise ValueError(f"a new stream begins (its stamps jump by {late:.0f} s)")
         frames, whole = round(late * self._rate), round(late * self._rate / length) * length
         # Drivers may lose any number of frames; without numbers, mostly whole messages are lost.
-        difference = length / 4
+        difference, jitter = length / 4, self._jitter * self._rate
         if first.skipped == 0:
-            difference = min(difference, (self._slack + self._jitter) * self._rate)
+            difference = min(difference, self._slack * self._rate + jitter)
+        elif frames % length <= self.LARGE_JITTER * jitter:  # delays make a message later, never earlier
+            return frames // length * length
         return whole if whole and abs(frames - whole) <= difference else frames
 
 
