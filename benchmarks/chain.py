@@ -37,7 +37,7 @@ from rosafe.dsp import kernels  # noqa: E402
 from rosafe.dsp.windows import window  # noqa: E402
 from rosafe.processing import chain  # noqa: E402
 from rosafe.representations import STAGES  # noqa: E402
-from rosafe.representations.filterbank import Filterbank  # noqa: E402
+from rosafe.representations.gammatone import Filterbank  # noqa: E402
 from rosafe.representations.registry import CORE_KINDS  # noqa: E402
 
 RATE = 44100

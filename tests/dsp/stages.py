@@ -8,7 +8,7 @@ import numpy as np
 
 from rosafe.dsp.stage import Stage
 from rosafe.representations import STAGES
-from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.gammatone import Filterbank
 from rosafe.representations.haircell import METHODS, InnerHairCell
 
 from .bare import FloatArray

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rosafe.dsp import kernels
 from rosafe.dsp.stage import Stage
 from rosafe.representations import STAGES
-from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.gammatone import Filterbank
 from rosafe.representations.haircell import InnerHairCell
 from rosafe.representations.preproc import PreProc
 from tests.representations.chain import core_chain

@@ -14,7 +14,7 @@ from rosafe.dsp.stage import Stage
 from rosafe.dsp.windows import window
 from rosafe.representations import STAGES
 from rosafe.representations.crosscorrelation import CrossCorrelation
-from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.gammatone import Filterbank
 from rosafe.representations.haircell import InnerHairCell
 from rosafe.representations.ild import Ild
 from rosafe.representations.input import Input

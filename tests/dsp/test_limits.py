@@ -12,7 +12,7 @@ from rosafe.dsp import kernels
 from rosafe.dsp.numeric_limits import LIMIT
 from rosafe.dsp.sos_filter import SosFilter, leaky_integrator
 from rosafe.representations import STAGES
-from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.gammatone import Filterbank
 from rosafe.representations.input import Input
 from rosafe.representations.preproc import PreProc
 from rosafe.representations.ratemap import Ratemap

@@ -14,7 +14,7 @@ from rosafe.dsp.middle_ear import middle_ear_fir
 from rosafe.dsp.rounding import round_half_away
 from rosafe.dsp.windows import ALL_NAMES, window
 from rosafe.representations.crosscorrelation import CrossCorrelation
-from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.gammatone import Filterbank
 from rosafe.representations.haircell import InnerHairCell
 from rosafe.representations.ild import Ild
 from rosafe.representations.preproc import PreProc

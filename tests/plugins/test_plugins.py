@@ -44,7 +44,7 @@ print(json.dumps([result["zeroCrossings"][:, 0, k].tolist() for k in (10, 90)]))
 
 RULES = """
 from rosafe.plugin import Parameter, Representation, Stage, variant
-from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.gammatone import Filterbank
 from rosafe.representations.pitch import Pitch
 from rosafe.representations.ratemap import Ratemap
 

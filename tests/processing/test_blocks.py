@@ -18,7 +18,7 @@ from rosafe.dsp import kernels
 from rosafe.processing import chain
 from rosafe.processing.files import process_file
 from rosafe.representations import BUILTIN, STAGES
-from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.gammatone import Filterbank
 from rosafe.representations.input import Input
 from rosafe.representations.ratemap import Ratemap
 from tests.dsp.implementations import NUMPY, levels, using

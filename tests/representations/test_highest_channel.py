@@ -9,7 +9,7 @@ import pytest
 
 import rosafe
 from rosafe.representations import STAGES
-from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.gammatone import Filterbank
 
 
 @pytest.mark.parametrize(
