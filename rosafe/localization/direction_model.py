@@ -10,6 +10,7 @@ independent: each counts with a weight.
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 from collections.abc import Callable, Mapping
@@ -127,6 +128,10 @@ class DirectionModel:
         """The number of channels."""
         return (len(self.itd_table) - 1) // (CLASSES * ITD_BINS)
 
+    @functools.cached_property
+    def _cue_weights(self) -> FloatArray:
+        return _weights(self.parameters["fb_cfHz"])
+
     def rows(self, cues: Cues, floor: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the rows (F, C) of both tables."""
         levels = level_class(cues.level, floor)
@@ -140,7 +145,7 @@ class DirectionModel:
 
     def unweighted_terms(self, itd_row: NDArray[np.intp], ild_row: NDArray[np.intp]) -> NDArray[np.float32]:
         """Return `terms` without the weights, which are for sums over frames and channels: those of each unit alone."""
-        itd, ild = _weights(self.parameters["fb_cfHz"])
+        itd, ild = self._cue_weights
         return _unweighted(self.itd_table, itd_row, itd, ITD_BINS) + _unweighted(self.ild_table, ild_row, ild, ILD_BINS)
 
     def add_evidence(
@@ -171,7 +176,7 @@ class DirectionModel:
         The weights get an exponent: 0 for ratios without weights.
         """
         valid = cues.valid[frames]
-        factors = (_weights(self.parameters["fb_cfHz"]) ** (exponent - 1)).astype(np.float32)
+        factors = (self._cue_weights ** (exponent - 1)).astype(np.float32)
         if kernels.compiled():
             return self._tables.units(cues, floor, frames, int(np.count_nonzero(valid)), factors)
         found = np.zeros((int(np.count_nonzero(valid)), len(self.azimuths)), np.float32)

@@ -21,7 +21,7 @@ BLOCK_SECONDS = UNIT / RATE  # of sound that is read together
 _WAIT = 0.1  # s between two checks whether there are subscribers
 _STEP = 0.05  # s after the last update of the tracks, when there are none any more
 _PAUSE = 1.0  # s after an error
-_SET = 0.05  # s, of a step in the times of the sound: the clock has been set
+_SET = 0.5  # s, of a step in the times of the sound: they were those of another stream, or the clock has been set
 
 
 class SoundBlock(NamedTuple):

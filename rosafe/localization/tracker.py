@@ -35,6 +35,7 @@ _MAX_LOG_ODDS = 2.2
 _GAIN, _MAX_GAIN = 8.0, 1.5  # log-odds per share above the needed one, and at most
 _LOSS = 0.7  # log-odds for each update with a smaller share
 MIN_LEVEL_DB = -200.0  # level of silence
+_CROSSING = 3.0  # s, at most, in which two sources have one candidate
 _COURSE = 20  # updates in which a source moves or does not
 _MOVED = 8.0  # degrees in these updates: a source that moves
 _SHARE_RATE = 0.2  # of the mean share of a track
@@ -64,6 +65,7 @@ class Track:
         self.share, self.power = candidate.share, candidate.power
         self.odds = candidate.odds  # mean against the front-back image
         self._clear_time = -math.inf
+        self.own_time = time  # when it had a candidate that is not also near another track without one
         self.log_odds = _BIRTH
         self._covariance = np.diag([_MEASUREMENT_STD**2, _VELOCITY_STD**2])
         self.history: list[tuple[float, float, float, float]] = []
@@ -95,12 +97,14 @@ class Track:
         noise = _ACCELERATION_STD**2 * np.array([[seconds**3 / 3, seconds**2 / 2], [seconds**2 / 2, seconds]])
         self._covariance = transition @ self._covariance @ transition.T + noise
 
-    def correct(self, candidate: Candidate, time: float) -> None:
-        """Update it with its candidate."""
-        innovation = float(angles.difference(candidate.azimuth, self.state[0]))
-        gain = self._covariance[:, 0] / (self._covariance[0, 0] + _MEASUREMENT_STD**2)
-        self.state = self.state + gain * innovation
-        self._covariance = self._covariance - np.outer(gain, self._covariance[0])
+    def correct(self, candidate: Candidate, time: float, is_own: bool = True) -> None:
+        """Update it with its candidate; it moves on as before if that is also the candidate of another source."""
+        if is_own:
+            innovation = float(angles.difference(candidate.azimuth, self.state[0]))
+            gain = self._covariance[:, 0] / (self._covariance[0, 0] + _MEASUREMENT_STD**2)
+            self.state = self.state + gain * innovation
+            self._covariance = self._covariance - np.outer(gain, self._covariance[0])
+            self.own_time = time
         self.power = candidate.power
         self.last_time = time
         self.odds += _ODDS_RATE * (candidate.odds - self.odds)
@@ -176,13 +180,20 @@ class Tracker:
             track.follow(yaw)
         self.time = time
         matched = self._assign(candidates)
+        shared = {
+            index: other
+            for index, track in enumerate(self.tracks)
+            if index not in matched and (other := self._shared(track, candidates)) is not None
+        }
         shares = [0.0] * len(self.tracks)  # evidence for each track
         for index, track in enumerate(self.tracks):
             if index in matched:
-                track.correct(candidates[matched[index]], time)
-                shares[index] = candidates[matched[index]].share
-            elif (other := self._shared(track, candidates)) is not None:
-                shares[index] = MIN_SHARE + (other.share - MIN_SHARE) / 2
+                candidate = candidates[matched[index]]
+                crosses = self.time - track.own_time < _CROSSING and any(one is candidate for one in shared.values())
+                track.correct(candidate, time, is_own=not crosses)
+                shares[index] = candidate.share
+            elif index in shared:
+                shares[index] = MIN_SHARE + (shared[index].share - MIN_SHARE) / 2
             track.share += _SHARE_RATE * (shares[index] - track.share)
         for share, track in zip(shares, self.tracks, strict=True):
             track.support(share - self._needed_share(track, yaw))
@@ -206,7 +217,7 @@ class Tracker:
 
     def _shared(self, track: Track, candidates: Sequence[Candidate]) -> Candidate | None:
         """Return the candidate of another track that this one, which is present, crosses; it moves on without one."""
-        if track.id:
+        if track.id and self.time - track.own_time < _CROSSING:
             for candidate in candidates:
                 if abs(float(angles.difference(candidate.azimuth, track.state[0]))) < SEPARATION:
                     return candidate

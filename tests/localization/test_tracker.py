@@ -105,6 +105,22 @@ def test_crossing_sources_keep_their_numbers() -> None:
         assert abs(track["azimuth"][-1]) > 30
 
 
+def test_a_source_moves_on_while_its_candidate_is_that_of_a_louder_one() -> None:
+    """It passes a source that stays, and is hidden by it for 1.8 s."""
+    moving = np.linspace(-40, 60, 60)
+    azimuths = [[10.0, a] if abs(a - 10) > 15 else [10.0] for a in moving.tolist()]
+    moved, stayed = sorted(run(azimuths).histories(), key=lambda track: -np.ptp(track["azimuth"]))
+    assert abs(moved["azimuth"][0] + 40) < 3 and abs(moved["azimuth"][-1] - 60) < 3
+    assert np.abs(stayed["azimuth"] - 10).max() < 2
+
+
+def test_a_source_that_ends_near_another_one_is_no_longer_present() -> None:
+    approach = [[10.0, a] if a < -5 else [10.0] for a in np.linspace(-40, -2, 25).tolist()]
+    moving, stayed = run([*approach, *[[10.0]] * 50]).histories()[::-1]
+    present = stayed["time"][stayed["probability"] > 0.5], moving["time"][moving["probability"] > 0.5]
+    assert present[0][-1] > 7.3 and present[1][-1] < 7.4 - 1.0, present
+
+
 def present_at_end(candidates: Sequence[Mapping[float, Any]]) -> list[float]:
     """Return the azimuths of the sources that are present after updates with candidates.
 

