@@ -83,12 +83,12 @@ def run(options: argparse.Namespace) -> int:
     """Run all checks and print the findings; return 0 if no required part is missing."""
     findings = {name: _examine(check) for name, check in CHECKS.items()}
     if missing.by_pip() or findings["ROS 2"].state == OK:
-        users = "nodes" if missing.by_pip() else "nodes of ROS 1"
-        for name in _OF_NODES:
+        users = "by nodes" if missing.by_pip() else "by nodes of ROS 1"
+        needed = {"alsaaudio": "for sound cards", "plots": "by rosafe plot"}
+        for name in (*_OF_NODES, "plots"):
             if findings[name].state == MISSING:
-                findings[name] = Finding(
-                    NOTE, f"needed only by {users} and their clients: {findings[name].detail.split('; ')[0]}"
-                )
+                use = needed.get(name, f"{users} and their clients")
+                findings[name] = Finding(NOTE, f"needed only {use}: {findings[name].detail.split('; ')[0]}")
     incomplete = any(finding.state == MISSING for finding in findings.values())
     if options.json:
         checks = [{"name": name, **finding._asdict()} for name, finding in findings.items()]
@@ -190,11 +190,6 @@ def _stale_in_shell() -> str:
     return "" if os.path.realpath(first) == os.path.realpath(expected) else f"this shell uses others, in {first}"
 
 
-def _plots() -> Finding:
-    found = _needs(_PLOTS)
-    return found._replace(state=NOTE) if found.state == MISSING and missing.by_pip() else found
-
-
 def _extras() -> Finding:
     found = [name for name in _EXTRAS if importlib.util.find_spec(name)]
     absent = [f"{name} ({missing.install(name)})" for name in _EXTRAS if name not in found]
@@ -287,6 +282,6 @@ CHECKS: dict[str, Callable[[], Finding]] = {
     "sound devices": _devices,
     "HTTP server": lambda: _needs(_HTTP),
     "Tcl": lambda: _needs(_TCL, _TCL_COMMANDS),
-    "plots": _plots,
+    "plots": lambda: _needs(_PLOTS),
     "extras": _extras,
 }

@@ -8,6 +8,7 @@ reverberant environments", IEEE/ACM Trans. Audio Speech Lang. Process. 25, 2444-
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -130,7 +131,7 @@ def count(
     histograms = Histograms(len(described["fb_cfHz"]), len(azimuths))
     skip = int(np.ceil(_SKIP_SECONDS * described["itd_frameRate"]))
     powers = np.zeros(2)  # of the sounds, and of their ratemaps
-    for azimuth, sound in sounds:
+    for azimuth, sound in _ahead(sounds):
         scaled = sound * _LEVEL
         features = process(scaled, sample_rate, parameters=values, outputs=list(cues.KINDS))
         quantized = cues.quantize(features, cues.scaling_db(values), max_itd)
@@ -150,6 +151,16 @@ def count(
         "max_itd": max_itd,
         "level_gain_db": float(10 * np.log10(powers[0] / powers[1])),
     }
+
+
+def _ahead(sounds: Iterable[tuple[float | None, FloatArray]]) -> Iterator[tuple[float | None, FloatArray]]:
+    """Yield sounds, of which another thread computes the next one in the meantime."""
+    source = iter(sounds)
+    with ThreadPoolExecutor(1) as worker:
+        following = worker.submit(next, source, None)
+        while (sound := following.result()) is not None:
+            following = worker.submit(next, source, None)
+            yield sound
 
 
 def _indices(grid: FloatArray, azimuths: FloatArray) -> np.ndarray:
