@@ -157,3 +157,23 @@ def test_another_python(tmp_path: Path) -> None:
     )
     found = findings(python(program))["python"]
     assert found["state"] == "MISSING" and "/usr/bin/python3" in found["todo"]
+
+
+def test_a_machine_with_ros_2_only() -> None:
+    """What only ROS 1, sound cards and pictures need is a note that says so."""
+    program = """
+import argparse
+from rosafe.commands import doctor
+lost = doctor.Finding(doctor.MISSING, "it is not installed; help", "install it")
+doctor.CHECKS = {name: lambda: lost for name in ("ROS", "alsaaudio", "plots")}
+doctor.CHECKS["ROS 2"] = lambda: doctor.Finding(doctor.OK, "here")
+raise SystemExit(doctor.run(argparse.Namespace(json=True)))
+"""
+    found = findings(python(program))
+    needed = {
+        "ROS": "by nodes of ROS 1 and their clients",
+        "alsaaudio": "for sound cards",
+        "plots": "by rosafe plot",
+    }
+    for name, use in needed.items():
+        assert found[name]["state"] == "note" and found[name]["detail"] == f"needed only {use}: it is not installed"
