@@ -129,7 +129,10 @@ class DemoSound(NamedTuple):
 
 
 class Port:
-    """Counts the frames of a port since the sound has begun last; keeps those of the input, lost ones as zeros."""
+    """Counts the frames of a port since the sound has begun last, up to those of `wanted` audio frames.
+
+    Keeps those of the input, lost ones as zeros.
+    """
 
     def __init__(self, kind: str) -> None:
         from rosafe.ros import PortReader
@@ -137,15 +140,16 @@ class Port:
         port, name = ROSAFE.port(CORE_REPRESENTATIONS[kind].port), CORE_REPRESENTATIONS[kind].name
         self.kind, self.type = kind, ros_type(port.idl)
         self.waits, self.index, self.frames, self.lost, self.rate = False, 0, 0, 0, 1.0
+        self.wanted = math.inf
         self.arrivals: list[float] = []
         self.sound: list[Frames] = []
         self.reader = PortReader(f"/rosAFE/{port.name}" + (f"/{name}" if port.multiple else ""), self._add)
 
     def _add(self, frames: Frames) -> None:
         if frames.restarted:
-            self.waits, self.frames, self.lost = False, 0, -frames.lost
+            self.waits, self.index, self.frames, self.lost = False, 0, 0, -frames.lost
             self.arrivals, self.sound = [], []
-        if self.waits:
+        if self.waits or self.index >= self.wanted:
             return
         self.arrivals.append(time.monotonic())
         self.frames += frames.data.shape[-1]
@@ -218,11 +222,11 @@ async def _follow(
     # The index of the new beginning is lower: this is how readers recognize it.
     if await _reach(launcher, ports, sound.sample_rate // 2) < sound.sample_rate // 2:
         raise CommandError(f"{sound.device}: no sound arrives; check it with rosafe record --device")
+    wanted = round(seconds * sound.sample_rate)
     for port in ports.values():
-        port.waits, port.index = True, 0
+        port.waits, port.index, port.wanted = True, 0, wanted
     await bass.outputs("Acquire", sound.acquire.values)
     _say(f"recording {len(ports)} ports for {seconds:g} s")
-    wanted = round(seconds * sound.sample_rate)
     if (frames := await _reach(launcher, ports, wanted)) < wanted:
         if sound.source is None or not frames:
             raise CommandError(f"{sound.device}: the sound has ended; check it with rosafe record --device")

@@ -44,6 +44,7 @@ def test_the_example_for_mute(graph: Graph) -> None:
     )
     waiting = "while not mute.get_num_connections(): rospy.sleep(0.01)\n"  # a user's node is connected already
     code = code.replace("mute.publish(True)", waiting + "mute.publish(True)") + "rospy.spin()\n"
+    code = code.replace("# speak", "rospy.sleep(2.0)")  # a queue of one message keeps the last one only
     with graph.collect("/localizer/mute", Bool) as messages, graph.start(PYTHON, "-c", code) as speaker:
         # a latched message that is published while a subscriber connects may arrive twice
         wait_for(
