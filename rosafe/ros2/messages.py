@@ -22,7 +22,7 @@ def ros_time(seconds: float) -> Time:
 
 
 def clock_offset(node: Node) -> float:
-    """Return by how much the clock of a node is ahead of the system's (s); it is with `use_sim_time`."""
+    """Return by how much the clock of a node is ahead of the system's (s); 0 without `use_sim_time`."""
     clock = node.get_clock()
     return clock.now().nanoseconds / 1e9 - time.time() if clock.ros_time_is_active else 0.0
 

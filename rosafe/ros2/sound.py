@@ -94,7 +94,7 @@ class Sound:
     Parameters
     ----------
     clock_offset : callable
-        Returns by how much the clock of the node is ahead of the system's (s); it is with `use_sim_time`.
+        Returns by how much the clock of the node is ahead of the system's (s); 0 without `use_sim_time`.
     log : object
         With `info`, `warning` and `error`.
     publish_truth : callable

@@ -160,7 +160,7 @@ def test_another_python(tmp_path: Path) -> None:
 
 
 def test_a_machine_with_ros_2_only() -> None:
-    """What only ROS 1, sound cards and pictures need is a note that says so."""
+    """Parts that only ROS 1, sound cards or pictures need are notes, which name the use."""
     program = """
 import argparse
 from rosafe.commands import doctor

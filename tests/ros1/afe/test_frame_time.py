@@ -82,7 +82,7 @@ def test_the_line_is_never_later_than_a_stamp(seconds: int) -> None:
 
 @pytest.mark.parametrize("speed", [0.0, 0.5, 0.99])
 def test_a_clock_that_is_slower_than_the_sound(speed: float) -> None:
-    """The clock of a simulation: the line, which can hardly change its rate, begins anew."""
+    """The clock of a simulation. The rate of the line can hardly change, so the fit restarts."""
     times = FrameTime()
     times.begin(16000)
     for frame in range(800, 20 * 16000, 800):

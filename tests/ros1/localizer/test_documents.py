@@ -6,6 +6,7 @@ import dataclasses
 import re
 from itertools import groupby
 
+import rospy
 from std_msgs.msg import Bool
 
 from rosafe.commands import localize
@@ -44,8 +45,11 @@ def test_the_example_for_mute(graph: Graph) -> None:
     )
     waiting = "while not mute.get_num_connections(): rospy.sleep(0.01)\n"  # a user's node is connected already
     code = code.replace("mute.publish(True)", waiting + "mute.publish(True)") + "rospy.spin()\n"
-    code = code.replace("# speak", "rospy.sleep(2.0)")  # a queue of one message keeps the last one only
+    code = code.replace("# speak", 'rospy.wait_for_message("/spoken", Bool)')
     with graph.collect("/localizer/mute", Bool) as messages, graph.start(PYTHON, "-c", code) as speaker:
+        wait_for(lambda: any(message.data for message in [*messages]), what=lambda: f"{speaker}")
+        spoken = rospy.Publisher("/spoken", Bool, queue_size=1, latch=True)
+        spoken.publish(True)
         # a latched message that is published while a subscriber connects may arrive twice
         wait_for(
             lambda: [one for one, _ in groupby(message.data for message in [*messages])] == [True, False],
