@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import logging
 import os
 import socket
 import threading
@@ -274,6 +275,8 @@ class PrivateMaster(contextlib.AbstractContextManager["PrivateMaster"]):
         import rosmaster.master
 
         set_local_defaults()
+        for name in ("xmlrpc", "rosmaster"):  # otherwise, Python prints the tracebacks of its dead clients to stderr
+            logging.getLogger(name).addHandler(logging.NullHandler())
         self._master = rosmaster.master.Master(port=0)
         self._master.start()
         self.uri = f"http://127.0.0.1:{self._master.master_node.port}"

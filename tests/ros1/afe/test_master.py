@@ -126,3 +126,29 @@ def test_the_end_does_not_wait_for_a_master(private_graph: tuple[Graph, MasterPr
         finally:
             bring_back()
         wait_for(lambda: "/rosAFE" not in graph.nodes(), what="the master receives the end later")
+
+
+DEAD_CLIENTS = """
+import logging, socket, struct, time
+from rosafe.ros1.transport.master import PrivateMaster, proxy
+records = []
+for name in ("xmlrpc", "rosmaster.threadpool"):
+    logging.getLogger(name).addFilter(lambda record: records.append(record.name) or True)
+with PrivateMaster() as master:
+    address = "127.0.0.1", int(master.uri.rsplit(":", 1)[1])
+    client = socket.create_connection(address)
+    client.sendall(b"POST / HT")
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    client.close()  # with a reset
+    server = proxy(master.uri)
+    server.registerSubscriber("/dead", "/topic", "*", "http://127.0.0.1:9")  # where nothing listens
+    server.registerPublisher("/dead", "/topic", "std_msgs/Empty", "http://127.0.0.1:9")
+    while len(set(records)) < 2:
+        time.sleep(0.01)
+"""
+
+
+def test_a_private_master_prints_nothing_about_dead_clients(graph: Graph) -> None:
+    """A program that runs one in its process, such as the demo, has a clean stderr."""
+    done = graph.run(PYTHON, "-c", DEAD_CLIENTS, PYTHONPATH=str(ROOT))
+    assert (done.stdout, done.stderr) == ("", "")
