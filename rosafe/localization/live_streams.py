@@ -13,12 +13,14 @@ import numpy as np
 
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.live import WARN, Status
+from rosafe.localization.localizer import UPDATE_SECONDS
 from rosafe.localization.speech import missing_detector
-from rosafe.localization.streams import RATE, UNIT, SourcePart, SourceStreams
+from rosafe.localization.streams import LAG, RATE, UNIT, SourcePart, SourceStreams
 from rosafe.localization.tracker import Track
 
 BLOCK_SECONDS = UNIT / RATE  # of sound that is read together
 _WAIT = 0.1  # s between two checks whether there are subscribers
+_PATIENCE = 0.5  # s of waiting for the tracks of a block: those of a busy machine are late
 _STEP = 0.05  # s after the last update of the tracks, when there are none any more
 _PAUSE = 1.0  # s after an error
 _SET = 0.5  # s, of a step in the times of the sound: they were those of another stream, or the clock has been set
@@ -72,10 +74,11 @@ class LiveStreams:
     ) -> None:
         self._publish, self._status = publish, status
         self._has_streams, self._has_speech = has_stream_subscribers, has_speech_subscribers
-        self._lock = threading.Lock()  # of the next five
+        self._lock = threading.Condition()  # of the next seven
         self._open: tuple[DirectionModel, Callable[[], LiveSound]] | None = None
         self._updates: list[tuple[float, list[Track], float]] = []
         self._first_id, self._moment = 0, 0.0  # of the last update
+        self._needed, self._follows = -math.inf, False  # time of the tracks for a block; whether they came in time
         self._speech: dict[int, float] = {}
         self._ended = threading.Event()
         self._detects = True
@@ -92,6 +95,8 @@ class LiveStreams:
     def close(self) -> None:
         """End the thread."""
         self._ended.set()
+        with self._lock:
+            self._lock.notify_all()
         if self._thread.ident is not None:
             self._thread.join()
 
@@ -110,15 +115,19 @@ class LiveStreams:
     def update(self, moment: float, tracks: Sequence[Track], yaw: float) -> None:
         """Use other tracks: those at a clock time (s), with the direction of the head in degrees."""
         with self._lock:
-            self._moment = moment
+            self._moment, self._follows = moment, moment >= self._needed
             copies = [_Present.of(track, self._first_id) for track in tracks if track.id]
             self._updates = [*self._updates[-20:], (moment, copies, yaw)]
+            self._lock.notify_all()
 
     def speech(self, id_: int) -> float:
         """Return the probability that the source with an id, counted from `first_id`, speaks; NaN if unknown."""
         return self._speech.get(id_, math.nan)
 
     # --- the thread ---
+
+    def _has_tracks(self) -> bool:
+        return self._moment >= self._needed or self._ended.is_set()
 
     def _wanted(self) -> bool:
         return self._has_streams() or (self._detects and self._has_speech())
@@ -162,6 +171,9 @@ class LiveStreams:
             end = block.first + block.samples.shape[1]
             start = block.time - (block.first - begin) / rate
             with self._lock:
+                self._needed = start + (end - begin) / rate - LAG - UPDATE_SECONDS
+                if self._follows and self._open is opened:
+                    self._follows = self._lock.wait_for(self._has_tracks, _PATIENCE)
                 updates, self._updates = self._updates, []
             for moment, tracks, yaw in updates:
                 streams.update(moment - start, tracks, yaw)

@@ -237,12 +237,15 @@ class SourceStreams:
         else:
             azimuth = newest.places[id_]
             earliest = -(self._begin(0) // HOP)  # the frame of the first sample
-            first = source.end if source else max(earliest, newest.number + 1 - round(BEFORE * RATE / HOP))
+            first = source.end if source else earliest
             frames = [frame.with_source(id_, azimuth, newest.yaw) for frame in self._frames if frame.number >= first]
             if not frames:
                 return []
             if source is None:
-                source = self._sources[id_] = _Source(self._begin(frames[0].number), self._detect)
+                own = frames[-round(BEFORE * RATE / HOP) :]
+                source = self._sources[id_] = _Source(self._begin(own[0].number), self._detect)
+                source.learn(id_, frames, self._masks)
+                frames = own
             source.azimuth = azimuth
         return [
             (self._begin(frame.number), source.process(id_, frame, self._masks), source.azimuth) for frame in frames
@@ -401,12 +404,23 @@ class _Source:
 
     def __init__(self, begin: int, detect_speech: bool) -> None:
         self.begin, self.azimuth, self.end = begin, 0.0, 0
+        self._learned, self._total = 0, np.zeros(())
         self.detector = SpeechDetector() if detect_speech else None
         self._covariance = np.zeros((2, 2, BINS), np.complex128)
         self._left: float | None = None  # part of the left ear in the last frame
         self._margin = 0.0  # degrees, in favour of the left ear
         self._sum = np.zeros(SIZE)  # of the overlapping frames
         self._silent = 0  # frames since it was present
+
+    def learn(self, id_: int, frames: Sequence[_SourceFrame], masks: _Masks) -> None:
+        """Compute the filter of all frames up to the newest one, before they are processed.
+
+        Without this, the first half second contains the other sources: a filter needs a past.
+        """
+        for frame in frames:
+            self._covariance = KEPT * self._covariance + masks.of(frame)[id_] * frame.covariance
+            self._total = KEPT * self._total + frame.covariance
+        self._learned = frames[-1].number + 1
 
     @property
     def has_ended(self) -> bool:
@@ -417,15 +431,17 @@ class _Source:
         """Return the HOP samples that are complete with the next frame."""
         azimuths = frame.turned()
         self._sum = np.append(self._sum[HOP:], np.zeros(HOP))
-        self._covariance *= KEPT ** (frame.number + 1 - self.end)
+        is_learned = frame.number < self._learned
+        self._covariance *= 1.0 if is_learned else KEPT ** (frame.number + 1 - self.end)
         self.end = frame.number + 1
         self._silent += 1
         if id_ in azimuths:
             self._silent = 0
             mask = masks.of(frame)[id_]
-            self._covariance += mask * frame.covariance
+            self._covariance += 0.0 if is_learned else mask * frame.covariance
             left = self._choose_ear(id_, azimuths)
-            found = spatial_filter.separate(frame.spectrum, self._covariance, frame.total, left)
+            total = self._total if is_learned else frame.total
+            found = spatial_filter.separate(frame.spectrum, self._covariance, total, left)
             self._sum += spatial_filter.overlap(found * mask)
         return self._sum[:HOP]
 

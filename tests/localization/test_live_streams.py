@@ -157,6 +157,27 @@ def test_the_first_times_are_those_of_another_stream(session: Session, sphere_mo
     assert session.parts[0][1] < CLOCK + 0.2
 
 
+def test_streams_wait_for_late_tracks(session: Session, sphere_model: Path, ears: np.ndarray) -> None:
+    """Those of a busy machine: the samples are the same. Tracks that come no more delay them once only."""
+    sound = Sound(ears)
+    offline = SourceStreams(DirectionModel.load(sphere_model), detect_speech=False)
+    updates = [(0.1 * number, [track(1, 40.0)] if number > 6 else []) for number in range(20)]
+    for moment, tracks in updates:
+        offline.update(moment, tracks)
+    same = offline.process(np.round(ears * 2**31).astype(np.int32))
+    session.streams.connect(DirectionModel.load(sphere_model), lambda: sound)
+    session.streams.update(CLOCK, [], 0.0)
+    session.streams.start()
+    for moment, tracks in updates[1:]:
+        wait_for(lambda before=moment - 0.1: session.streams._needed > CLOCK + before)  # type: ignore[misc]
+        session.streams.update(CLOCK + moment, tracks, 0.0)
+    wait_for(lambda: sound.at_end, what="the end of the sound")
+    assert len(session.parts) > 100 and len(session.parts) == len(same)
+    for (part, _), expected in zip(session.parts, same, strict=True):
+        assert (part.first_sample, part.time) == (expected.first_sample, pytest.approx(expected.time))
+        assert np.array_equal(part.samples, expected.samples)
+
+
 def test_a_block_without_a_time_is_kept() -> None:
     ring = AudioRing(lambda line: None)
     known: list[bool] = []
