@@ -36,6 +36,7 @@ class Dereverberator(OwnState):
     def __init__(self, bins: int) -> None:
         size = 2 * _TAPS
         self._past = np.zeros((bins, _DELAY + _TAPS, 2), np.complex128)  # the newest frame first
+        self._powers = np.zeros((_DELAY, bins))  # of both ears, likewise
         self._prediction = np.zeros((bins, 2, size), np.complex128)
         self._inverse = np.tile(
             _START * np.eye(size, dtype=np.complex128), (bins, 1, 1)
@@ -44,10 +45,11 @@ class Dereverberator(OwnState):
     def process(self, spectrum: ComplexArray) -> ComplexArray:
         """Return the next frame (2, K) without late reverberation."""
         self._past = np.concatenate((spectrum.T[:, np.newaxis], self._past[:, :-1]), axis=1)
+        self._powers = np.concatenate((_power(spectrum)[np.newaxis], self._powers[:-1]))
         past = self._past[:, _DELAY:].reshape(len(self._past), -1, 1)
         late = self._prediction @ past
         early = spectrum.T[..., np.newaxis] - late
-        power = np.mean(np.abs(self._past[:, :_DELAY]) ** 2, axis=(1, 2))[:, np.newaxis, np.newaxis] + _SILENCE
+        power = self._powers.mean(axis=0)[:, np.newaxis, np.newaxis] / 2 + _SILENCE
         projected = self._inverse @ past
         energy = np.maximum(np.sum(past.conj() * projected, axis=1, keepdims=True).real, 0.0)
         gain = projected / (_KEPT * power + energy)
@@ -57,10 +59,10 @@ class Dereverberator(OwnState):
         size = np.einsum("kii->k", self._inverse).real / self._inverse.shape[1]
         self._inverse *= (1 / np.maximum(size / _START, _KEPT))[:, np.newaxis, np.newaxis]
         predicted = late[..., 0].T
-        part = _MAX_LATE * _amplitude(spectrum) / np.maximum(_amplitude(predicted), 1e-150)
+        part = _MAX_LATE * np.sqrt(self._powers[0] / np.maximum(_power(predicted), 1e-300))
         return np.asarray(spectrum - np.minimum(part, 1.0) * predicted)
 
 
-def _amplitude(spectrum: ComplexArray) -> FloatArray:
-    """Return the amplitude (K,) of both ears together."""
-    return np.asarray(np.sqrt((np.abs(spectrum) ** 2).sum(axis=0)))
+def _power(spectrum: ComplexArray) -> FloatArray:
+    """Return the power (K,) of both ears together."""
+    return np.asarray((spectrum.real**2 + spectrum.imag**2).sum(axis=0))

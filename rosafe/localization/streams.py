@@ -330,9 +330,12 @@ class _SourceFrame(NamedTuple):
             return self
         return self._replace(places={**self.places, id_: azimuth}, yaw=self.yaw if math.isfinite(self.yaw) else yaw)
 
-    def turned(self) -> dict[int, float]:
-        """Return the azimuths relative to the head."""
-        return {id_: float(angles.wrap(azimuth - self.yaw)) for id_, azimuth in self.places.items()}
+
+class _Mask(NamedTuple):
+    """The mask (BINS,) of a source, and its lateral angle in degrees."""
+
+    values: FloatArray
+    lateral: float
 
 
 class _Masks:
@@ -354,7 +357,7 @@ class _Masks:
     def reset(self) -> None:
         """Forget all sound."""
         self._levels = np.empty((0, len(self._bins)))  # of the last frames, dB
-        self._last: tuple[_SourceFrame | None, dict[int, FloatArray]] = None, {}
+        self._last: tuple[_SourceFrame | None, dict[int, _Mask]] = None, {}
 
     def terms(self, features: Mapping[str, FloatArray]) -> NDArray[np.float32]:
         """Return the log-likelihood ratios (F, C, A) of new frames for all directions."""
@@ -365,25 +368,25 @@ class _Masks:
         floors = [cues.floors(levels[max(0, end - WINDOW) : end]) for end in range(first, len(levels) + 1)]
         return self._model.unweighted_terms(*self._model.rows(found, np.array(floors).reshape(found.level.shape)))
 
-    def of(self, frame: _SourceFrame) -> dict[int, FloatArray]:
-        """Return the masks (BINS,) of the sources of a frame.
+    def of(self, frame: _SourceFrame) -> dict[int, _Mask]:
+        """Return the masks of the sources of a frame.
 
         Sources at nearly equal lateral angles are not separated.
         """
         if self._last[0] is frame:
             return self._last[1]
-        azimuths = frame.turned()
+        azimuths = np.array(list(frame.places.values())) - frame.yaw
         likelihood = np.exp(frame.terms - frame.terms.max(axis=-1, keepdims=True), dtype=np.float64)
-        laterals = angles.lateral(np.array(list(azimuths.values())))
+        laterals = angles.lateral(azimuths)
         distance = np.abs(self._lateral - laterals[:, np.newaxis])
         wanted, diffuse = (
             chosen / chosen.sum(axis=1, keepdims=True) @ likelihood.T
             for chosen in (distance <= WIDTH + 1e-9, distance > WIDTH + GAP)
         )
-        apart = np.clip((np.abs(laterals - laterals[:, np.newaxis]) - WIDTH) / GAP, 0.0, 1.0)
+        apart = np.minimum(np.maximum(np.abs(laterals - laterals[:, np.newaxis]) - WIDTH, 0.0) / GAP, 1.0)
         ratios = np.log((wanted + _LEAST) / (_DIFFUSE * diffuse + apart @ wanted + _LEAST))
         masks = 1 / (1 + np.exp(-_OFFSET - _SLOPE * ratios)) @ self._bins
-        self._last = frame, dict(zip(azimuths, masks, strict=True))
+        self._last = frame, dict(zip(frame.places, map(_Mask, masks, laterals.tolist()), strict=True))
         return self._last[1]
 
 
@@ -418,7 +421,7 @@ class _Source:
         Without this, the first half second contains the other sources: a filter needs a past.
         """
         for frame in frames:
-            self._covariance = KEPT * self._covariance + masks.of(frame)[id_] * frame.covariance
+            self._covariance = KEPT * self._covariance + masks.of(frame)[id_].values * frame.covariance
             self._total = KEPT * self._total + frame.covariance
         self._learned = frames[-1].number + 1
 
@@ -429,25 +432,25 @@ class _Source:
 
     def process(self, id_: int, frame: _SourceFrame, masks: _Masks) -> FloatArray:
         """Return the HOP samples that are complete with the next frame."""
-        azimuths = frame.turned()
         self._sum = np.append(self._sum[HOP:], np.zeros(HOP))
         is_learned = frame.number < self._learned
         self._covariance *= 1.0 if is_learned else KEPT ** (frame.number + 1 - self.end)
         self.end = frame.number + 1
         self._silent += 1
-        if id_ in azimuths:
+        if id_ in frame.places:
             self._silent = 0
-            mask = masks.of(frame)[id_]
+            found_masks = masks.of(frame)
+            mask = found_masks[id_].values
             self._covariance += 0.0 if is_learned else mask * frame.covariance
-            left = self._choose_ear(id_, azimuths)
+            left = self._choose_ear({key: one.lateral for key, one in found_masks.items()}, id_)
             total = self._total if is_learned else frame.total
             found = spatial_filter.separate(frame.spectrum, self._covariance, total, left)
             self._sum += spatial_filter.overlap(found * mask)
         return self._sum[:HOP]
 
-    def _choose_ear(self, id_: int, azimuths: Mapping[int, float]) -> float:
+    def _choose_ear(self, laterals: Mapping[int, float], id_: int) -> float:
         """Return the part of the left ear: the ear on the side of the source, and away from the others."""
-        own, *others = (float(angles.lateral(azimuths[key])) for key in sorted(azimuths, key=lambda k: k != id_))
+        own, others = laterals[id_], [laterals[key] for key in sorted(laterals) if key != id_]
         margin = 2 * own - (sum(others) / len(others) if others else 0.0)
         if self._left is None:
             self._margin, self._left = margin, float(margin >= 0)

