@@ -407,7 +407,7 @@ class _Source:
 
     def __init__(self, begin: int, detect_speech: bool) -> None:
         self.begin, self.azimuth, self.end = begin, 0.0, 0
-        self._learned, self._total = 0, np.zeros(())
+        self._learned, self._total = 0, np.zeros((2, 2, BINS), np.complex128)
         self.detector = SpeechDetector() if detect_speech else None
         self._covariance = np.zeros((2, 2, BINS), np.complex128)
         self._left: float | None = None  # part of the left ear in the last frame

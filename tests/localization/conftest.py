@@ -15,9 +15,8 @@ from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.head import Head
 from tests import harness, models
 
-from .sounds import RECORDINGS, music
+from .sounds import RATE, RECORDINGS, music
 
-RATE = 16000
 TALKER, MUSIC = 30.0, -40.0  # degrees, in `take`
 KEMAR = Path("/usr/share/libmysofa/MIT_KEMAR_normal_pinna.sofa")
 

@@ -1,15 +1,21 @@
-"""Music, and recordings of speech."""
+"""Music, recordings of speech, and voices that cross."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import scipy.signal
+import soundfile
 
+from rosafe.localization.head import Head
+
+RATE = 16000
 RECORDINGS = Path("/usr/share/sounds/alsa")  # of Debian's alsa-utils
 
 
-def music(seconds: float, seed: int, rate: int = 16000) -> np.ndarray:
+def music(seconds: float, seed: int, rate: int = RATE) -> np.ndarray:
     """Return chords of plucked strings, some with a beat."""
     random = np.random.default_rng(seed)
     sound = np.zeros(int(seconds * rate))
@@ -26,3 +32,34 @@ def music(seconds: float, seed: int, rate: int = 16000) -> np.ndarray:
             sound[begin : begin + len(beat)] += 3 * beat * np.exp(-np.arange(len(beat)) / (0.015 * rate))
         begin += int(random.uniform(0.15, 0.5) * rate)
     return sound
+
+
+def crossing(ears: np.ndarray, path: Path) -> np.ndarray:
+    """Write a recording in which the first voice of `take` moves past the second one, which stays.
+
+    Return the ears of both voices, (2, 2, N).
+    """
+    dry = [np.resize(voice[side, 800:], 7 * RATE) for side, voice in enumerate(ears)]
+    head = Head.sphere()
+    truths = head.render(dry[0], RATE, np.linspace(-50, 70, len(dry[0]))), head.render(dry[1], RATE, 10.0)
+    soundfile.write(path, (truths[0] + truths[1]).T, RATE, subtype="PCM_32")
+    return np.stack(truths)
+
+
+def assert_crossed(parts: list[tuple[int, float, Any]], truths: np.ndarray) -> None:
+    """Check that the streams of `crossing` keep their voices: parts are ids, times of first samples (s), samples."""
+    ids = [id_ for id_, _, _ in parts]
+    longest = sorted(set(ids), key=ids.count)[-2:]
+    begin = min(time for _, time, _ in parts)
+    orders = []
+    for first, last in ((1.0, 2.5), (4.5, 6.0)):  # before and after they cross
+        likeness = np.empty((2, 2))
+        for row, wanted in enumerate(longest):
+            own = [samples for id_, time, samples in parts if id_ == wanted and first < time - begin < last]
+            sound = np.concatenate(own).astype(float)
+            for column, truth in enumerate(truths):
+                found = [np.abs(scipy.signal.correlate(ear, sound, "valid")).max() for ear in truth]
+                energy = [np.sqrt(np.mean(ear**2) * len(sound) * np.sum(sound**2)) for ear in truth]
+                likeness[row, column] = np.max(np.array(found) / energy)
+        orders.append(likeness.argmax(axis=1).tolist())
+    assert orders[0] == orders[1] and sorted(orders[0]) == [0, 1], orders

@@ -88,6 +88,22 @@ def test_two_talkers_are_separated_and_one_is_left_as_it_is(kemar: Head, model: 
     assert np.std(found) == pytest.approx(np.std(truths[1][0]), rel=0.1)
 
 
+def test_a_stream_begins_without_the_other_source(kemar: Head, model: DirectionModel) -> None:
+    """Two sources are found after 0.8 s: the 0.6 s before are separate, too."""
+    truths = talkers(kemar, (0.0, 60.0))
+    streams = SourceStreams(model, detect_speech=False)
+    streams.update(-1.0, [])
+    streams.update(0.7, [track(3, 0.0), track(5, 60.0)])
+    parts = separate(streams, truths[0] + truths[1])
+    for id_, truth in zip((3, 5), truths, strict=True):
+        found, improvements = aligned(parts[id_], truth.shape[1]), []
+        for begin in (0.2, 0.8):
+            part = slice(round(begin * RATE), round((begin + 0.6) * RATE))
+            after = si_sdr(np.stack((found, found))[:, part], truth[:, part]).max()
+            improvements.append(after - si_sdr((truths[0] + truths[1])[:, part], truth[:, part]).mean())
+        assert improvements[0] > 7, improvements
+
+
 def test_samples_do_not_depend_on_blocks(kemar: Head, model: DirectionModel) -> None:
     ears = np.add(*talkers(kemar, (0.0, 60.0)))
     results = []

