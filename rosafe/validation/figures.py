@@ -218,9 +218,9 @@ def _published_panel(axes: Axes, pair: tuple[Published, Panel]) -> None:
 
 FIGURES_HEAD = """# Published figures
 
-Curves of publications with the same curves of rosAFE. `rosafe validate --figures FOLDER` writes this page and its
-pictures. Each figure says how its published values were obtained. [Validation](validation.md) contains the comparisons
-with tolerances.
+For hearing scientists: curves of publications with the same curves of rosAFE. `rosafe validate --figures FOLDER`
+writes this page and its pictures. Each figure says how its published values were obtained. [Validation](validation.md)
+contains the comparisons with tolerances.
 """
 
 

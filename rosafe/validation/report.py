@@ -151,9 +151,9 @@ def line(row: Row, disturbed: bool = False) -> str:
 
 HEAD = """# Validation
 
-This page compares numbers of rosAFE with expected numbers. The tables separate the comparisons by the origin of the
-expected number, because only the first kind shows that a representation is right. The last of these commands writes
-the page:
+For hearing scientists: comparisons of numbers of rosAFE with expected numbers. The tables separate the comparisons by
+the origin of the expected number, because only the first kind shows that a representation is right. The last of these
+commands writes the page:
 
 ```sh
 rosafe validate                        # a line for each comparison; without network
