@@ -74,11 +74,12 @@ class LiveStreams:
     ) -> None:
         self._publish, self._status = publish, status
         self._has_streams, self._has_speech = has_stream_subscribers, has_speech_subscribers
-        self._lock = threading.Condition()  # of the next seven
+        self._lock = threading.Condition()  # of the next eight
         self._open: tuple[DirectionModel, Callable[[], LiveSound]] | None = None
         self._updates: list[tuple[float, list[Track], float]] = []
         self._first_id, self._moment = 0, 0.0  # of the last update
-        self._needed, self._follows = -math.inf, False  # time of the tracks for a block; whether they came in time
+        self._needed, self._follows = -math.inf, True  # time of the tracks for a block; whether they came in time
+        self._set_back = False  # whether the clock was
         self._speech: dict[int, float] = {}
         self._ended = threading.Event()
         self._detects = True
@@ -105,6 +106,8 @@ class LiveStreams:
         with self._lock:
             self._open = (model, open_sound) if model is not None and open_sound is not None else None
             self._updates.clear()
+            self._follows = True
+            self._lock.notify_all()
 
     def begin_again(self, first_id: int) -> None:
         """Forget the present sources; ids of later tracks are counted from `first_id`."""
@@ -115,6 +118,8 @@ class LiveStreams:
     def update(self, moment: float, tracks: Sequence[Track], yaw: float) -> None:
         """Use other tracks: those at a clock time (s), with the direction of the head in degrees."""
         with self._lock:
+            if moment < self._moment - _SET:  # earlier updates have later times
+                self._updates, self._set_back = [], True
             self._moment, self._follows = moment, moment >= self._needed
             copies = [_Present.of(track, self._first_id) for track in tracks if track.id]
             self._updates = [*self._updates[-20:], (moment, copies, yaw)]
@@ -126,8 +131,9 @@ class LiveStreams:
 
     # --- the thread ---
 
-    def _has_tracks(self) -> bool:
-        return self._moment >= self._needed or self._ended.is_set()
+    def _has_tracks(self, opened: Any) -> bool:
+        """Return whether the tracks for the block have arrived, or nothing waits for them any more."""
+        return self._moment >= self._needed or self._open is not opened or self._ended.is_set()
 
     def _wanted(self) -> bool:
         return self._has_streams() or (self._detects and self._has_speech())
@@ -172,8 +178,11 @@ class LiveStreams:
             start = block.time - (block.first - begin) / rate
             with self._lock:
                 self._needed = start + (end - begin) / rate - LAG - UPDATE_SECONDS
-                if self._follows and self._open is opened:
-                    self._follows = self._lock.wait_for(self._has_tracks, _PATIENCE)
+                if self._follows:
+                    self._follows = self._lock.wait_for(lambda: self._has_tracks(opened), _PATIENCE)  # noqa: B023
+                if self._set_back or self._open is not opened:
+                    self._set_back, end = False, -1  # begin again with the next block
+                    continue
                 updates, self._updates = self._updates, []
             for moment, tracks, yaw in updates:
                 streams.update(moment - start, tracks, yaw)

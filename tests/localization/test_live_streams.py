@@ -202,3 +202,26 @@ def test_a_block_without_a_time_is_kept() -> None:
         known.append(True)
         blocks = [wait_for(lambda: sound.read(0.01)) for _ in range(2)]
     assert [(block.first, block.samples[0, 0]) for block in blocks if block] == [(0, 0), (320, 1)]
+
+
+@pytest.mark.parametrize("late", [False, True], ids=["in time", "after the step"])
+def test_a_clock_that_is_set_back(session: Session, sphere_model: Path, ears: np.ndarray, late: bool) -> None:
+    """Updates with times of the old clock, also those that come after the step, do not hide the new ones."""
+    sound, step = Sound(ears), RATE // 320 * 320
+    sound._blocks = iter([block._replace(time=block.time - 100 * (block.first >= step)) for block in sound._blocks])
+    session.streams.connect(DirectionModel.load(sphere_model), lambda: sound)
+    read = sound.read
+
+    def read_and_update(seconds: float) -> SoundBlock | None:
+        block = read(seconds)
+        if block is not None:
+            old = block.first < step + 1600 * late
+            moment = CLOCK - (0 if old else 100) + block.first / RATE
+            session.streams.update(moment, [track(1, 40.0)], 0.0)
+        return block
+
+    sound.read = read_and_update  # type: ignore[method-assign]
+    session.streams.start()
+    wait_for(lambda: sound.at_end, what=lambda: f"the end: {session.status.lines}")
+    after = [part for part, moment in session.parts if moment < CLOCK - 50]
+    assert sum(len(part.samples) for part in after) > 1.3 * RATE

@@ -265,6 +265,9 @@ class _Answer(http.client.HTTPResponse):
         return data
 
 
+_NO_OUTPUT = logging.NullHandler()
+
+
 class PrivateMaster(contextlib.AbstractContextManager["PrivateMaster"]):
     """A ROS master in this process, on a free port of the loopback interface, started by the constructor.
 
@@ -276,7 +279,7 @@ class PrivateMaster(contextlib.AbstractContextManager["PrivateMaster"]):
 
         set_local_defaults()
         for name in ("xmlrpc", "rosmaster"):  # otherwise, Python prints the tracebacks of its dead clients to stderr
-            logging.getLogger(name).addHandler(logging.NullHandler())
+            logging.getLogger(name).addHandler(_NO_OUTPUT)
         self._master = rosmaster.master.Master(port=0)
         self._master.start()
         self.uri = f"http://127.0.0.1:{self._master.master_node.port}"
