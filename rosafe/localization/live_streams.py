@@ -179,7 +179,7 @@ class LiveStreams:
             with self._lock:
                 self._needed = start + (end - begin) / rate - LAG - UPDATE_SECONDS
                 if self._follows:
-                    self._follows = self._lock.wait_for(lambda: self._has_tracks(opened), _PATIENCE)  # noqa: B023
+                    self._follows = self._lock.wait_for(lambda: self._has_tracks(opened), _PATIENCE)
                 if self._set_back or self._open is not opened:
                     self._set_back, end = False, -1  # begin again with the next block
                     continue
