@@ -74,12 +74,8 @@ class LiveStreams:
     ) -> None:
         self._publish, self._status = publish, status
         self._has_streams, self._has_speech = has_stream_subscribers, has_speech_subscribers
-        self._lock = threading.Condition()  # of the next eight
         self._open: tuple[DirectionModel, Callable[[], LiveSound]] | None = None
-        self._updates: list[tuple[float, list[Track], float]] = []
-        self._first_id, self._moment = 0, 0.0  # of the last update
-        self._needed, self._follows = -math.inf, True  # time of the tracks for a block; whether they came in time
-        self._set_back = False  # whether the clock was
+        self._updates = _Updates()
         self._speech: dict[int, float] = {}
         self._ended = threading.Event()
         self._detects = True
@@ -96,44 +92,29 @@ class LiveStreams:
     def close(self) -> None:
         """End the thread."""
         self._ended.set()
-        with self._lock:
-            self._lock.notify_all()
+        self._updates.wake()
         if self._thread.ident is not None:
             self._thread.join()
 
     def connect(self, model: DirectionModel | None, open_sound: Callable[[], LiveSound] | None = None) -> None:
         """Use the sound that `open_sound` opens, with the model of the head; None: there is none."""
-        with self._lock:
-            self._open = (model, open_sound) if model is not None and open_sound is not None else None
-            self._updates.clear()
-            self._follows = True
-            self._lock.notify_all()
+        self._updates.clear()
+        self._open = (model, open_sound) if model is not None and open_sound is not None else None
+        self._updates.wake()
 
     def begin_again(self, first_id: int) -> None:
         """Forget the present sources; ids of later tracks are counted from `first_id`."""
-        with self._lock:
-            self._first_id = first_id
-            self._updates.append((self._moment + _STEP, [], 0.0))
+        self._updates.begin_again(first_id)
 
     def update(self, moment: float, tracks: Sequence[Track], yaw: float) -> None:
         """Use other tracks: those at a clock time (s), with the direction of the head in degrees."""
-        with self._lock:
-            if moment < self._moment - _SET:  # earlier updates have later times
-                self._updates, self._set_back = [], True
-            self._moment, self._follows = moment, moment >= self._needed
-            copies = [_Present.of(track, self._first_id) for track in tracks if track.id]
-            self._updates = [*self._updates[-20:], (moment, copies, yaw)]
-            self._lock.notify_all()
+        self._updates.add(moment, tracks, yaw)
 
     def speech(self, id_: int) -> float:
         """Return the probability that the source with an id, counted from `first_id`, speaks; NaN if unknown."""
         return self._speech.get(id_, math.nan)
 
     # --- the thread ---
-
-    def _has_tracks(self, opened: Any) -> bool:
-        """Return whether the tracks for the block have arrived, or nothing waits for them any more."""
-        return self._moment >= self._needed or self._open is not opened or self._ended.is_set()
 
     def _wanted(self) -> bool:
         return self._has_streams() or (self._detects and self._has_speech())
@@ -176,14 +157,11 @@ class LiveStreams:
                 streams.reset()
             end = block.first + block.samples.shape[1]
             start = block.time - (block.first - begin) / rate
-            with self._lock:
-                self._needed = start + (end - begin) / rate - LAG - UPDATE_SECONDS
-                if self._follows:
-                    self._follows = self._lock.wait_for(lambda: self._has_tracks(opened), _PATIENCE)
-                if self._set_back or self._open is not opened:
-                    self._set_back, end = False, -1  # begin again with the next block
-                    continue
-                updates, self._updates = self._updates, []
+            needed = start + (end - begin) / rate - LAG - UPDATE_SECONDS
+            updates = self._updates.take(needed, lambda: self._open is not opened or self._ended.is_set())
+            if updates is None:
+                end = -1  # begin again with the next block
+                continue
             for moment, tracks, yaw in updates:
                 streams.update(moment - start, tracks, yaw)
             for part in streams.process(samples):
@@ -199,6 +177,60 @@ def _on_grid(first: int, rate: float) -> int:
     """
     unit = rate * BLOCK_SECONDS
     return -int(-first // unit * unit) if unit == int(unit) else first
+
+
+class _Updates:
+    """The tracks that have not been used yet, with their clock times (s). The streams wait for those that are late."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._waiting: list[tuple[float, list[Track], float]] = []
+        self._first_id, self._moment = 0, 0.0  # of the last update
+        self._needed, self._follows = -math.inf, True  # time of the tracks for the sound; whether they came in time
+        self._set_back = False  # whether the clock was
+
+    def add(self, moment: float, tracks: Sequence[Track], yaw: float) -> None:
+        """Add the tracks at a clock time."""
+        with self._changed:
+            if moment < self._moment - _SET:  # earlier updates have later times
+                self._waiting, self._set_back = [], True
+            self._moment, self._follows = moment, moment >= self._needed
+            copies = [_Present.of(track, self._first_id) for track in tracks if track.id]
+            self._waiting = [*self._waiting[-20:], (moment, copies, yaw)]
+            self._changed.notify_all()
+
+    def begin_again(self, first_id: int) -> None:
+        """There are no tracks any more; ids of later ones are counted from `first_id`."""
+        with self._changed:
+            self._first_id = first_id
+            self._waiting.append((self._moment + _STEP, [], 0.0))
+
+    def clear(self) -> None:
+        """Forget all tracks."""
+        with self._changed:
+            self._waiting.clear()
+            self._follows = True
+            self._changed.notify_all()
+
+    def wake(self) -> None:
+        """Let `take` look whether it is over."""
+        with self._changed:
+            self._changed.notify_all()
+
+    def take(self, needed: float, is_over: Callable[[], bool]) -> list[tuple[float, list[Track], float]] | None:
+        """Return the new tracks, those at the time `needed` included, if they arrive in time.
+
+        None: the clock was set back, or it is over.
+        """
+        with self._changed:
+            self._needed = needed
+            if self._follows:
+                self._follows = self._changed.wait_for(lambda: self._moment >= needed or is_over(), _PATIENCE)
+            if self._set_back or is_over():
+                self._set_back = False
+                return None
+            found, self._waiting = self._waiting, []
+            return found
 
 
 class _Present(NamedTuple):

@@ -169,7 +169,7 @@ def test_streams_wait_for_late_tracks(session: Session, sphere_model: Path, ears
     session.streams.update(CLOCK, [], 0.0)
     session.streams.start()
     for moment, tracks in updates[1:]:
-        wait_for(lambda before=moment - 0.1: session.streams._needed > CLOCK + before)  # type: ignore[misc]
+        wait_for(lambda before=moment - 0.1: session.streams._updates._needed > CLOCK + before)  # type: ignore[misc]
         session.streams.update(CLOCK + moment, tracks, 0.0)
     wait_for(lambda: sound.at_end, what="the end of the sound")
     assert len(session.parts) > 100 and len(session.parts) == len(same)
