@@ -200,7 +200,7 @@ class _Updates:
             self._changed.notify_all()
 
     def begin_again(self, first_id: int) -> None:
-        """There are no tracks any more; ids of later ones are counted from `first_id`."""
+        """End all tracks; ids of later ones are counted from `first_id`."""
         with self._changed:
             self._first_id = first_id
             self._waiting.append((self._moment + _STEP, [], 0.0))
@@ -209,7 +209,7 @@ class _Updates:
         """Forget all tracks."""
         with self._changed:
             self._waiting.clear()
-            self._follows = True
+            self._follows, self._set_back = True, False
             self._changed.notify_all()
 
     def wake(self) -> None:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rosafe.declarations.text import short_repr
 from rosafe.dsp.dereverberation import Dereverberator
 from rosafe.dsp.framing import FrameGrid
 from rosafe.dsp.gammatone_synthesis import ComplexArray
@@ -160,7 +161,16 @@ class SourceStreams:
             are not present for more than 0.3 s.
         yaw : float
             Direction of the head at this time, degrees in world coordinates.
+
+        Raises
+        ------
+        ValueError
+            A time or direction that is not a number, or a direction beyond the limits; nothing has changed.
         """
+        if not angles.in_limits(yaw):
+            raise ValueError(f"yaw: expected a number {angles.LIMITS}, got {short_repr(yaw)}")
+        if math.isnan(time):
+            raise ValueError("time: expected a number in s, got nan")
         turn, before = 0.0, _NONE
         if self._states:
             before = self._states[-1]

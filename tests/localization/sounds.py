@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -46,17 +47,21 @@ def crossing(ears: np.ndarray, path: Path) -> np.ndarray:
     return np.stack(truths)
 
 
-def assert_crossed(parts: list[tuple[int, float, Any]], truths: np.ndarray) -> None:
-    """Check that the streams of `crossing` keep their voices: parts are ids, times of first samples (s), samples."""
-    ids = [id_ for id_, _, _ in parts]
+def assert_crossed(parts: list[tuple[int, float, int, Any]], truths: np.ndarray) -> None:
+    """Check that the streams of `crossing` keep their voices, without gaps.
+
+    Parts are ids, times (s) and numbers of their first samples, and samples.
+    """
+    ids = [id_ for id_, *_ in parts]
     longest = sorted(set(ids), key=ids.count)[-2:]
-    begin = min(time for _, time, _ in parts)
+    begin = min(time for _, time, *_ in parts)
     orders = []
     for first, last in ((1.0, 2.5), (4.5, 6.0)):  # before and after they cross
         likeness = np.empty((2, 2))
         for row, wanted in enumerate(longest):
-            own = [samples for id_, time, samples in parts if id_ == wanted and first < time - begin < last]
-            sound = np.concatenate(own).astype(float)
+            own = [part[2:] for part in parts if part[0] == wanted and first < part[1] - begin < last]
+            assert all(after[0] == before[0] + len(before[1]) for before, after in itertools.pairwise(own))
+            sound = np.concatenate([samples for _, samples in own]).astype(float)
             for column, truth in enumerate(truths):
                 found = [np.abs(scipy.signal.correlate(ear, sound, "valid")).max() for ear in truth]
                 energy = [np.sqrt(np.mean(ear**2) * len(sound) * np.sum(sound**2)) for ear in truth]

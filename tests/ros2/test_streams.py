@@ -109,7 +109,8 @@ def test_voices_that_cross_keep_their_ids(
     assert client.call("acquire", device=f"file:{tmp_path / 'cross.wav'}")["success"]
     parts = client.take("streams", 1)
     parts += rest(client, parts[-1])
-    assert_crossed([(m["id"], seconds(m["header"]["stamp"]), m["samples"]) for m in parts], truths)
+    of_parts = [(m["id"], seconds(m["header"]["stamp"]), m["first_sample"], m["samples"]) for m in parts]
+    assert_crossed(of_parts, truths)
 
 
 def test_poses_of_sources_that_speak(

@@ -141,7 +141,7 @@ with PrivateMaster() as master:
     client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     client.close()  # with a reset
     server = proxy(master.uri)
-    server.registerSubscriber("/dead", "/topic", "*", "http://127.0.0.1:9")  # where nothing listens
+    server.registerSubscriber("/dead", "/topic", "*", "http://127.0.0.1:9")  # no process listens there
     server.registerPublisher("/dead", "/topic", "std_msgs/Empty", "http://127.0.0.1:9")
     while len(set(records)) < 2:
         time.sleep(0.01)

@@ -64,7 +64,7 @@ def test_a_fan_is_not_a_source(graph: Graph, talking: Process) -> None:
     with graph.collect("/localizer/sources", SoundSources) as messages:
 
         def heard() -> bool:
-            """Return whether the talker was found for 2 s and ended twice: a machine that stands also ends him."""
+            """Return whether the talker was found for 2 s and ended twice: a stalled machine also ends a track."""
             talks = [near(message, TALKER) for message in list(messages)]
             ends = sum(before and not now for before, now in itertools.pairwise(talks))
             return ends >= 2 and sum(talks) >= 20

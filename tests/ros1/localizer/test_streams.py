@@ -178,7 +178,7 @@ def test_voices_that_cross_keep_their_ids(graph: Graph, localizer: Localizer, ta
         acquire(graph, f"file:{tmp_path / 'cross.wav'}")
         wait_for(lambda: received and received[-1].header.stamp.to_sec() + 1.5 < time.time(), what="the end")
         messages = list(received)
-    assert_crossed([(m.id, m.header.stamp.to_sec(), m.samples) for m in messages], truths)
+    assert_crossed([(m.id, m.header.stamp.to_sec(), m.first_sample, m.samples) for m in messages], truths)
 
 
 def test_streams_without_the_detector(
@@ -234,7 +234,7 @@ def test_the_example_takes_what_the_talker_says_live_and_from_a_bag(
         count = len(parts)
         wait_for(lambda: len(parts) > count + 20, what="more sound, so that the recorder has what was heard")
         assert recorder.stop(signal.SIGINT) == 0
-        wait_for((tmp_path / "a.bag").exists, what="the end of the recording")  # by a child of the program
+        wait_for((tmp_path / "a.bag").exists, what="the end of the recording")  # a child process of rosbag
     environment = {**graph.env, "PYTHONPATH": "/usr/lib/python3/dist-packages"}
     with Process([PYTHON, "-c", FROM_A_BAG, str(tmp_path / "a.bag")], environment) as reader:
         assert reader.wait() == 0, reader
