@@ -10,7 +10,7 @@ from typing import Any
 from rosafe.declarations.parameter import format_value
 from rosafe.declarations.reference import LITERATURE, Citation, Reference, applicable
 from rosafe.declarations.representation import Representation
-from rosafe.system.version import AUTHORS, VERSION
+from rosafe.system.version import AUTHORS, RELEASED, VERSION
 
 FRONT_END = LITERATURE["twoears2018"]
 _WIDTH = 100  # characters of a line
@@ -165,6 +165,7 @@ def citation_file(publications: Iterable[Reference]) -> str:
         "title": TITLE,
         "type": "software",
         "version": VERSION,
+        "date-released": RELEASED,
         "license": "BSD-3-Clause",
         "authors": _authors(software()),
         "abstract": "Binaural auditory representations (gammatone and DRNL filterbanks, inner hair cells, interaural "

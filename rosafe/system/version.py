@@ -1,4 +1,5 @@
-"""Version and authors. Tests check that the manifests of all packages, the licence and CITATION.cff have the same."""
+"""Version, date and authors. Tests check that the manifests of all packages, the licence and CITATION.cff have the same."""
 
-VERSION = "0.3.0"
+VERSION = "0.4.0"
+RELEASED = "2026-11-26"  # the date of this version, or of the last one while changes are unreleased
 AUTHORS = "rosAFE maintainers"  # also in package.xml, pyproject.toml, LICENSE, docs/conf.py and debian/

@@ -6,10 +6,14 @@ import inspect
 import re
 from operator import attrgetter
 
+import pytest
+
 import rosafe
 from rosafe.interface import KINDS
-from rosafe.system.version import VERSION
+from rosafe.system.version import RELEASED, VERSION
 from tests.harness import ROOT
+
+MANIFESTS = ("package.xml", "bass/package.xml", "ros2/rosafe_msgs/package.xml", "ros2/rosafe_ros2/package.xml")
 
 
 def listed() -> dict[str, tuple[str, str]]:
@@ -65,3 +69,19 @@ def test_versions() -> None:
     of_0_2 = {"process", "Stream", "load", "plot", "to_xarray", "__version__"}
     of_0_2 |= {f"Stream.{method}" for method in ("process", "reset", "modify", "describe")}
     assert {name for name, version in first.items() if version <= (0, 2)} == of_0_2
+    assert {name for name, version in first.items() if version == (0, 4)} == {"Head.pair", "Localizer.updated_at"}
+
+
+@pytest.mark.parametrize(
+    ("file", "line"),
+    [
+        *((path, f"  <version>{VERSION}</version>") for path in MANIFESTS),
+        ("CITATION.cff", f"version: {VERSION}"),
+        ("CITATION.cff", f"date-released: '{RELEASED}'"),
+        ("CHANGELOG.md", f"## {VERSION} ({RELEASED})"),
+        ("SECURITY.md", f"| {VERSION.rpartition('.')[0]} | yes |"),
+        ("docs/validation.md", f"Version {VERSION}: .*"),
+    ],
+)
+def test_files_that_name_the_version(file: str, line: str) -> None:
+    assert re.search(f"^{line if line.endswith('*') else re.escape(line)}$", (ROOT / file).read_text("utf-8"), re.MULTILINE)
