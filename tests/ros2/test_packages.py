@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 import pytest
 
 from tests.harness import ROOT, wait_for
+from tests.packaging.test_ros2_archives import archives
 
 from .network import Network
 
@@ -43,8 +44,10 @@ def sourced(env: dict[str, str], install: Path) -> dict[str, str]:
 
 
 def test_the_node_of_a_workspace(ros2: Network, tmp_path: Path) -> None:
-    """Built without links, it runs without the checkout; its files are those of the checkout."""
-    install = build(ros2.env, tmp_path, OWN)
+    """Built of the source archive, it runs without the checkout; its files are those of the checkout."""
+    _, archive = archives(tmp_path)
+    subprocess.run(["tar", "-C", tmp_path, "-xf", archive], check=True)
+    install = build(ros2.env, tmp_path, tmp_path / "rosafe_ros2")
     prefix = install / "rosafe_ros2"
     assert (prefix / "share/ament_index/resource_index/packages/rosafe_ros2").is_file()
     assert (prefix / "share/rosafe_ros2/launch/rosafe.launch.py").read_bytes() == LAUNCH.read_bytes()
