@@ -169,8 +169,8 @@ def citation_file(publications: Iterable[Reference]) -> str:
         "license": "BSD-3-Clause",
         "authors": _authors(software()),
         "abstract": "Binaural auditory representations (gammatone and DRNL filterbanks, inner hair cells, interaural "
-        "differences, cross-correlation, ratemaps and representations derived from them) as a ROS 1 node and as a "
-        "Python package, with localization of sound sources.",
+        "differences, cross-correlation, ratemaps and representations derived from them) as nodes for ROS 1 and "
+        "ROS 2 and as a Python package, with localization of sound sources.",
         "keywords": [
             "binaural hearing",
             "auditory models",
