@@ -187,6 +187,19 @@ def test_command_reports_missing_packages(venv: Venv, tmp_path: Path) -> None:
 
 
 @pytest.mark.exploration
+def test_a_compiler_that_fails(tmp_path: Path) -> None:
+    """pip would install a package that is slower; a wheel for others needs its kernels."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    (programs / "gcc").write_text("#!/bin/sh\necho 'gcc: fatal error: no space' >&2\nexit 1\n")
+    (programs / "gcc").chmod(0o755)
+    with fresh_copy() as copy:
+        done = run(copy / "scripts" / "make-wheel", tmp_path, env=environment(PATH=f"{programs}:/usr/bin:/bin"))
+    assert done.returncode == 1 and done.stdout == ""
+    assert done.stderr.startswith("scripts/make-wheel: rosafe: gcc cannot build the kernels: gcc: fatal error: no space")
+
+
+@pytest.mark.exploration
 def test_without_a_compiler(tmp_path: Path) -> None:
     """The wheel is built for any machine, and the status reports that numpy and scipy are used."""
     programs = tmp_path / "bin"

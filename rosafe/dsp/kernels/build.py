@@ -34,7 +34,7 @@ ISA_LEVELS = {"x86_64": {2: "x86-64-v2", 3: "x86-64-v3", 4: "x86-64-v4"}, "aarch
 # -O3 is slower: it unrolls loops that are unrolled already. Without -ffp-contract=off the compiler may fuse products
 # and sums; without -fno-math-errno square roots are not vectorised.
 FLAGS = ("-std=gnu11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", "-Wall", "-Wextra")
-COMPILE_TIMEOUT_SECONDS = 120  # the compiler takes about 3 s
+COMPILE_TIMEOUT_SECONDS = 600  # the compiler takes about 3 s, but minutes if thirty other programs compute
 SUMS = "libraries.sha256"  # in each folder, for sha256sum
 MAX_FOLDERS = 3  # programs of other versions may use the other folders
 
