@@ -80,8 +80,7 @@ def test_versions() -> None:
         ("CITATION.cff", f"date-released: '{RELEASED}'"),
         ("CHANGELOG.md", f"## {VERSION} ({RELEASED})"),
         ("SECURITY.md", f"| {VERSION.rpartition('.')[0]} | yes |"),
-        ("docs/validation.md", f"Version {VERSION}: .*"),
     ],
 )
 def test_files_that_name_the_version(file: str, line: str) -> None:
-    assert re.search(f"^{line if line.endswith('*') else re.escape(line)}$", (ROOT / file).read_text("utf-8"), re.MULTILINE)
+    assert line in (ROOT / file).read_text("utf-8").splitlines()

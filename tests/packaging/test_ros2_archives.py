@@ -1,4 +1,4 @@
-"""Source archives of the ROS 2 packages: reproducible, and complete without the checkout. tests/ros2 builds a workspace of them."""
+"""Source archives of the ROS 2 packages: complete and reproducible. tests/ros2 builds a workspace of one."""
 
 from __future__ import annotations
 
