@@ -186,6 +186,14 @@ def test_command_reports_missing_packages(venv: Venv, tmp_path: Path) -> None:
         assert message in done.stderr
 
 
+def test_tests_for_other_interpreters_exist() -> None:
+    """tests/packaging/pythons is not part of the suite."""
+    script = (ROOT / "tests" / "packaging" / "pythons").read_text("utf-8")
+    copied = [f"tests/{name}" for name in re.findall(r"^cp -r (.*) \"", script, re.MULTILINE)[0].split()]
+    named = copied + re.findall(r"tests/[\w/]+(?:\.py)?", script)
+    assert len(named) > 8 and all((ROOT / path).exists() for path in named), named
+
+
 @pytest.mark.exploration
 def test_a_compiler_that_fails(tmp_path: Path) -> None:
     """pip would install a package that is slower; a wheel for others needs its kernels."""
