@@ -11,8 +11,8 @@ from rosafe.declarations import ros_names
 from rosafe.interface import CORE_REPRESENTATIONS, LAYOUTS, format_value, ros_type
 from rosafe.interface.rosafe import parameter_struct
 from rosafe.ros1.component import serialization
+from rosafe.tree.history import WindowView
 from rosafe.tree.processor import Processor
-from rosafe.tree.sliding_window import WindowView
 
 _EMPTY = WindowView([np.zeros(0)])  # for fields that a kind does not use, such as ILD's `right`
 
