@@ -42,7 +42,7 @@ def times(count: int = 20) -> dict[str, float]:
 
     from rosafe.ros import array_msg
     from rosafe.ros1.transport.publisher import send_pieces
-    from rosafe.tree.sliding_window import SlidingWindow
+    from rosafe.tree.history import SlidingWindow
 
     window = SlidingWindow((2, 31), graph.RATE)
     for seed in range(6):

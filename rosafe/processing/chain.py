@@ -44,7 +44,7 @@ class _GatedSource:
         self._max_frames: int | None = None  # of a merged block; None before `start`
         self._wake: Callable[[], None] = lambda: None
 
-    def open(self, wake: Callable[[], None]) -> None:
+    def open(self, wake: Callable[[], None], required_frames: Callable[[], float]) -> None:
         self._wake = wake
 
     def start(self, max_frames: int) -> None:

@@ -76,10 +76,14 @@ class Source(Protocol):
     def waiting(self) -> bool:
         """See the class."""
 
-    def open(self, wake: Callable[[], None]) -> None:
+    def open(self, wake: Callable[[], None], required_frames: Callable[[], float]) -> None:
         """Call `wake` from now on whenever there may be a block to read, or the end. `wake` returns immediately.
 
         The tree reads once without being woken, because a block may be there already.
+
+        `required_frames()` returns how many frames the tree needs, in total from the first one, before the next awaited
+        output can be complete; infinite if none is awaited, and 0 if it is unknown. A source of short blocks may read
+        several as one until then.
         """
 
     def read(self) -> tuple[NDArray[Any], int] | None:

@@ -84,6 +84,8 @@ class Processor(StateMachine):
     ----------
     trusted : bool
         Whether its stage is not a plugin, which may not return.
+    awaited : bool
+        Whether each frame of its output is needed as soon as it is complete, for example by a subscriber.
     error : BaseException or None
         The reason for its failure.
     blocks : int
@@ -94,6 +96,7 @@ class Processor(StateMachine):
 
     parent: Processor | None
     children: list[Processor]  # type: ignore[assignment]  # state machines, all of which are processors
+    awaited = True
 
     def __init__(
         self,
@@ -222,6 +225,17 @@ class Processor(StateMachine):
             self._context.on_failure(self)
             return None
 
+    def required_input(self) -> float:
+        """Return a number of input frames before which no awaited frame can be complete, of this processor or below.
+
+        It is infinite if no output is awaited, and 0 while a block is on its way to such an output. To be called with
+        the tree's lock held.
+        """
+        frames = min([child.required_input() for child in self.children] + [1 if self.awaited else math.inf])
+        if not 0 < frames < math.inf:
+            return frames
+        return self.changes.required_input(int(frames)) if self.waits else 0
+
     def on_ready(self) -> None:
         self._context.workers.push(self)
 
@@ -306,11 +320,12 @@ class SourceReader:
         self._processor = processor
         self._source = source
         self._workers = workers
+        self._frames = 0  # that the processor has accepted in total
         self.stop = source.stop
 
     def start(self) -> None:
         """Begin to read."""
-        self._source.open(self._wake)
+        self._source.open(self._wake, self._required_frames)
         self._notify_workers()
 
     def check(self) -> None:
@@ -333,8 +348,14 @@ class SourceReader:
             if got is not None:
                 block = Block(processor.blocks, (got[0],), got[1], processor.stage.input_format)
                 processor.accept_input_block(block, more)
+                self._frames += got[0].shape[-1]
             elif ended:
                 processor.end_of_stream()
+
+    def _required_frames(self) -> float:
+        """Return the argument of `Source.open`. Observers are to see each block."""
+        with self._workers.lock:
+            return 0 if self._processor.observers else self._frames + self._processor.required_input()
 
     def _wake(self) -> None:
         """Run short tasks on the thread of the source. Observers show the worker of each task, and need workers."""
@@ -362,23 +383,3 @@ def subtree(processor: Processor) -> Iterator[Processor]:
     for child in list(processor.children):
         yield from subtree(child)
     yield processor
-
-
-def next_output(processor: Processor) -> int:
-    """Return an index of audio: blocks that end before it complete no frame of output. 0 if it is unknown.
-
-    It is known while the processor and its ancestors wait for the next block.
-    """
-    chain = [processor]
-    while chain[0].parent is not None:
-        chain.insert(0, chain[0].parent)
-    root, *descendants = chain
-    processed = root.last_block
-    # Blocks move from the root down. A processor that waits after its ancestors did so has nothing left to process,
-    # unless the root has released another block.
-    if processed is None or root.state is not State.WAIT_EXEC or not all(one.waits for one in descendants):
-        return 0
-    frames = 1
-    for one in reversed(descendants):
-        frames = one.changes.required_input(frames)
-    return processed.next_index + frames if processed is root.last_block else 0

@@ -147,7 +147,7 @@ class StateMachine:
     @property
     def waits(self) -> bool:
         """Return whether it has processed and released all blocks that it was offered."""
-        return self.state is WAIT_EXEC and self._next_block is None and not self.busy
+        return self.state is WAIT_EXEC and self._next_block is None
 
     @property
     def finished(self) -> bool:

@@ -22,7 +22,7 @@ from rosafe.interface.arguments import check_parameters
 from rosafe.processing.chain import Chain
 from rosafe.ros1.component import serialization, state_publisher
 from rosafe.ros1.transport import registration
-from rosafe.tree.sliding_window import SlidingWindow, frames_in
+from rosafe.tree.history import SlidingWindow, frames_in
 from tests import harness
 from tests.harness import free_port, freeze, proc, run_together, wait_for
 from tests.ros1.afe.session import Session, assert_holds

@@ -45,7 +45,7 @@ class Feed:
         self.ended = True
         self._wake()
 
-    def open(self, wake: Callable[[], None]) -> None:
+    def open(self, wake: Callable[[], None], required_frames: Callable[[], float]) -> None:
         self._wake = wake
 
     def read(self) -> tuple[np.ndarray, int] | None:

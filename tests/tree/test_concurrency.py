@@ -111,7 +111,7 @@ def test_removed_processors_are_freed_without_garbage_collection(feed: Feed, mon
     try:
         end(tree, listener)
         listener.forget()
-        feed.open(lambda: None)
+        feed.open(lambda: None, lambda: 0)
         assert [one() for one in objects if one() is not None] == []
     finally:
         gc.enable()

@@ -36,15 +36,18 @@ class Numbers:
     def __init__(self, numbers: range, ends: bool = True) -> None:
         self.ended = self.stopped = False
         self.numbers = deque(numbers)
+        self.frames = 0  # that were read
         self.wake: Callable[[], None] = lambda: None
+        self.required_frames: Callable[[], float] = lambda: 0
         self._ends = ends
 
-    def open(self, wake: Callable[[], None]) -> None:
-        self.wake = wake
+    def open(self, wake: Callable[[], None], required_frames: Callable[[], float]) -> None:
+        self.wake, self.required_frames = wake, required_frames
 
     def read(self) -> tuple[np.ndarray, int] | None:
         if self.numbers and not self.stopped:
             number = self.numbers.popleft()
+            self.frames = number + 1
             return np.full((2, 1), float(number)), number + 1
         self.ended = self.ended or self._ends
         return None
@@ -183,6 +186,34 @@ def wake(scheduler: Scheduler, count: int, real_time: bool = False) -> Check:
     def check() -> None:
         log.assert_run(root, 0, 2)
         log.assert_run(child, 0, 2)
+
+    return check
+
+
+def require(scheduler: Scheduler, count: int) -> Check:
+    """A source asks which frame is required while blocks are on their way. Two of them complete an awaited output."""
+    tree = Tree(Log(), count, real_time=True)
+    source = Numbers(range(0), ends=False)
+    tree.add_input("input", source, 1, 0.0, 0.0).awaited = False
+    tree.add("preProc", "between", "input").awaited = False
+    tree.add("gammatone", "pairs", "between")
+    answers: list[tuple[float, int]] = []
+
+    def play() -> None:
+        for number in range(3):
+            source.numbers.append(number)
+            source.wake()
+            required = source.required_frames()
+            answers.append((required, source.frames))
+
+    player = scheduler.threading.Thread(play, "player")
+    player.start()
+    player.join()
+    end(tree)
+
+    def check() -> None:
+        late = [(required, read) for required, read in answers if required > 2 * (read // 2 + 1)]
+        assert not late, f"(required, read): {late}"
 
     return check
 
@@ -326,9 +357,23 @@ class Failing(Plain):
         return block
 
 
+class Pairs(Plain):
+    """A stage whose output is complete after every second block of one frame."""
+
+    blocks = 0
+
+    def compute(self, block: np.ndarray) -> np.ndarray:
+        self.blocks += 1
+        return block
+
+    def required_input(self, frames: int) -> int:
+        return 2 * frames - self.blocks % 2
+
+
 @pytest.fixture(autouse=True)
 def plain_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_plain_stages(monkeypatch, preProc=Failing)
+    use_plain_stages(monkeypatch, preProc=Failing, gammatone=Pairs)
+    monkeypatch.setattr(parameter_updates, "FramedStage", Pairs)
     monkeypatch.setattr(workers, "WAKE_THRESHOLD_SECONDS", 0.0)
 
 
@@ -344,6 +389,7 @@ SCENARIOS = (
     (wake, 1),
     (receive, 2),
     (receive_until_stop, 2),
+    (require, 2),
     (without_consumers, 1),
     (shrink, 2),
     (remove_child, 2),

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.tree.block import Block
-from rosafe.tree.history import History
-from rosafe.tree.sliding_window import MAX_PIECES, MIN_PIECE_BYTES, SlidingWindow, WindowView, frames_in
+from rosafe.tree.history import MAX_PIECES, MIN_PIECE_BYTES, History, SlidingWindow, WindowView, frames_in
 
 ROWS = st.sampled_from([(2,), (2, 3), (3,), (2, 5)])
 SIZES = st.lists(st.one_of(st.integers(0, 5), st.integers(0, 60)), max_size=3 * MAX_PIECES)

@@ -31,7 +31,7 @@ RING_SECONDS = 10.0  # the tree may fall behind by this much before frames are l
 OVERLAP_CHECK_FRAMES = 1000  # frames of a window that are compared with the previous window
 CURRENT_CHUNKS = 2  # a message is of a running acquisition if its newest frame is at most this old
 NEXT_MESSAGE_SECONDS = 0.25  # that a new reader waits for another message if the last one is older
-COMBINED_SECONDS = 0.1  # of sound; the most that a reader of unobserved blocks reads at once
+COMBINED_SECONDS = 0.1  # of sound; the most that is read at once, in short blocks of which no output is awaited
 PAUSE_SECONDS = 0.05  # after a message; then such a reader does not wait for more sound
 LAG_SECONDS = 0.4  # for which at least one whole block may be waiting
 BLOCK_SIZES = (110, 220, 441, 882, 2205, 4410, DEFAULT_FRAMES_PER_BLOCK)  # frames; the proposed sizes
@@ -133,7 +133,6 @@ class AudioRing:
         self.lock = threading.Condition()  # also guards all attributes
         self._window = 0  # frames in the last message
         self._current_until = 0.0  # s since 1970, of the last message; infinite if it has no stamp
-        self.arrived_at = 0.0  # s, monotonic, of the last message
         self._discontinuity = 1  # number of the first frame after the last one
         self._readers: list[AudioReader] = []
         self._connection: object = None
@@ -177,10 +176,9 @@ class AudioRing:
             chunk_seconds = message.nFramesPerChunk / message.sampleRate
             self._current_until = stamp + CURRENT_CHUNKS * chunk_seconds if stamp else math.inf
             self.lock.notify_all()
-            self.arrived_at = time.monotonic()
-            complete = [reader for reader in self._readers if reader.notice_message()]
-        for reader in complete:
-            reader.wake()
+            readers = list(self._readers)
+        for reader in readers:
+            reader.notice_message()
 
     def refuse(self, why: str) -> None:
         """Count a message that could not be deserialized."""
@@ -221,7 +219,7 @@ class AudioRing:
     def _begin(self, sample_rate: int, newest: int, window: int) -> None:
         """Begin a new stream. The current message contains its newest min(window, newest) frames."""
         self._drop_unread()
-        capacity = max([int(RING_SECONDS * sample_rate), window, *(r.required_frames for r in self._readers)])
+        capacity = max([int(RING_SECONDS * sample_rate), window, *(2 * r.frames_per_block for r in self._readers)])
         self.frames.clear(capacity, max(0, newest - window))
         self._discontinuity = self.frames.oldest
         self.sample_rate, self._window = sample_rate, window
@@ -283,16 +281,15 @@ class AudioRing:
             if self.sample_rate == 0:
                 return None
             reader = AudioReader(self, frames_per_block, self._report)
-            self.frames.reserve(reader.required_frames)
+            self.frames.reserve(2 * frames_per_block)  # the block to read, and the one that arrives meanwhile
             self._readers.append(reader)
             return reader
 
     def catch_up(self) -> bool:
         """Let all readers read the blocks that have arrived. Return whether there were any."""
         with self.lock:
-            late = [reader for reader in self._readers if reader.await_arrived()]
-        for reader in late:
-            reader.wake()
+            readers = list(self._readers)
+        late = [reader for reader in readers if reader.catch_up()]
         return bool(late)
 
     def remove(self, reader: AudioReader) -> None:
@@ -321,99 +318,103 @@ class AudioRing:
 class AudioReader:
     """The source of the input processor: successive blocks of one stream, from the next frame on.
 
+    It decides how many short blocks are read at once: as many as the next awaited output needs (see `Source.open`), up
+    to `COMBINED_SECONDS`.
+
     Audio at another rate than at the start is not delivered, because the tree was built for that rate. To be created
     with the lock of the ring.
     """
 
     def __init__(self, ring: AudioRing, frames_per_block: int, report: Callable[[str], None]) -> None:
         self.frames_per_block = frames_per_block
-        self.required_frames = 2 * frames_per_block  # the block to read, and the one that arrives meanwhile
         self.sample_rate = float(ring.sample_rate)
         self.position = ring.frames.newest + 1  # number of the next frame to read
         self.lag = LagMonitor(self.sample_rate, frames_per_block, report)
         self.ended = False
-        # Called with the length of a block. Blocks that end before the returned frame are not needed yet.
-        self.next_output: Callable[[int], float] = lambda _: 0
-        self.wake: Callable[[], None] = lambda: None
-        self._awaited = 0  # number of the last frame that a request waits for
-        self._planned = 0  # blocks to read at once, from the last check whether there are enough; 0 before the first
         self._ring = ring
+        self._arrived_at = 0.0  # s, monotonic, of the last message
+        self._requested = 0  # number of the last frame that a request waits for
+        self._delivered = 0  # frames read in total
+        self.open(lambda: None)
 
-    # --- called by the ring, with its lock ---
+    # --- called by the ring ---
 
     def begin(self, position: int) -> None:
-        """Continue with frame `position`, for which no request waits."""
-        self.position, self._awaited = position, 0
+        """Continue with frame `position`, for which no request waits. To be called with the lock of the ring."""
+        self.position, self._requested = position, 0
 
-    def notice_message(self) -> bool:
-        """Note that a message has arrived. Return whether there are as many unread blocks as are read at once."""
-        self.lag.update(self.unread, self._ring.arrived_at)
-        return self._is_complete(self._ring.arrived_at)
+    def notice_message(self) -> None:
+        """Note that a message has arrived, and wake the tree if there are enough blocks."""
+        with self._ring.lock:
+            self._arrived_at = time.monotonic()
+            self.lag.update(self.unread, self._arrived_at)
+            due = self._due_blocks()
+        if due:
+            self._wake()
 
-    def await_arrived(self) -> bool:
-        """Read all blocks that have arrived as soon as possible. Return whether there are any."""
-        late = self.unread >= self.frames_per_block
+    def catch_up(self) -> bool:
+        """Let the tree read all blocks that have arrived. Return whether there are any."""
+        with self._ring.lock:
+            late = self.unread >= self.frames_per_block
+            if late:
+                self._requested = self._ring.frames.newest
         if late:
-            self._awaited, self._planned = self._ring.frames.newest, 0
+            self._wake()
         return late
 
     @property
     def unread(self) -> int:
-        """The number of frames that have arrived and are not read yet."""
-        if self.sample_rate != self._ring.sample_rate:
+        """The number of frames that have arrived and are to be read. To be called with the lock of the ring."""
+        if self.ended or self.sample_rate != self._ring.sample_rate:
             return 0
         return self._ring.frames.newest + 1 - max(self.position, self._ring.frames.oldest)
 
-    def _is_complete(self, now: float) -> bool:
-        unread = self.unread // self.frames_per_block
-        self._planned = self._combined_blocks() if unread >= 1 else 0
-        if not 1 <= unread < self._planned:
-            return unread >= 1
-        return self.position <= self._awaited or now - self._ring.arrived_at > PAUSE_SECONDS
-
-    def _combined_blocks(self) -> int:
-        """Return the number of blocks to read at once."""
-        most = int(COMBINED_SECONDS * self.sample_rate / self.frames_per_block)
-        needed = (self.next_output(self.frames_per_block) - self.position) / self.frames_per_block
-        return max(1, most if needed > most else math.ceil(needed))
+    def _due_blocks(self) -> int:
+        """Return the number of blocks to read now; 0 to wait for more sound."""
+        block = self.frames_per_block
+        arrived = self.unread // block
+        if not arrived:
+            return 0
+        most = COMBINED_SECONDS * self.sample_rate // block * block
+        due = max(1, math.ceil(min(self._required_frames() - self._delivered, most) / block))
+        if arrived >= due:
+            return due
+        late = self.position <= self._requested or time.monotonic() - self._arrived_at > PAUSE_SECONDS
+        return arrived if late else 0
 
     # --- called by the tree ---
 
-    def open(self, wake: Callable[[], None]) -> None:
-        """Call `wake` whenever audio has arrived."""
-        self.wake = wake
+    def open(self, wake: Callable[[], None], required_frames: Callable[[], float] = lambda: 0) -> None:
+        """See `Source`."""
+        self._wake, self._required_frames = wake, required_frames
 
     def read(self) -> tuple[np.ndarray, int] | None:
-        """Return the next block, int32 (2, n), or several unobserved ones, and the number of the frame after it.
-
-        Returns None if it is incomplete.
-        """
-        count, frames = self.frames_per_block, self._ring.frames
+        """Return the next blocks, int32 (2, n), and the number of the frame after them, or None if none are due."""
+        frames = self._ring.frames
         with self._ring.lock:
-            if self.ended or self._ring.sample_rate != self.sample_rate:
+            blocks = self._due_blocks()
+            if not blocks:
                 return None
             self._ring.record_gap(self.position, frames.oldest - self.position)
-            self.position = max(self.position, frames.oldest)
-            blocks = min((frames.newest + 1 - self.position) // count, self._planned or self._combined_blocks())
-            if blocks < 1:
-                return None
-            first, self.position = self.position, self.position + blocks * count
+            first = max(self.position, frames.oldest)
+            count = blocks * self.frames_per_block
+            self.position, self._delivered = first + count, self._delivered + count
             self.lag.blocks_read(blocks)
             self.lag.update(self.unread, time.monotonic())
-            return frames.copy(first, blocks * count), self.position
+            return frames.copy(first, count), self.position
 
     @property
     def waiting(self) -> bool:
-        """Whether there is nothing to read yet; `wake` is called when there is."""
+        """See `Source`."""
         with self._ring.lock:
-            return not self.ended and not self._is_complete(time.monotonic())
+            return not self.ended and not self._due_blocks()
 
     def stop(self) -> None:
-        """Read no further block, and forget the function of `open`, which refers to the caller."""
+        """Read no further block, and forget the functions of `open`, which refer to the caller."""
         with self._ring.lock:
             self.ended = True
             self._ring.remove(self)
-        self.wake = lambda: None
+        self.open(lambda: None)
 
 
 class LagMonitor:

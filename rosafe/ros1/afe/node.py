@@ -21,7 +21,7 @@ from rosafe.declarations.text import short_repr
 from rosafe.dsp import kernels
 from rosafe.interface import KINDS, REQUEST, ROSAFE, ComponentError, Representation
 from rosafe.representations import PLUGINS, PROBLEMS, STAGES, WARNINGS
-from rosafe.ros1.afe import responses
+from rosafe.ros1.afe import messages
 from rosafe.ros1.afe.audio_input import AudioInput
 from rosafe.ros1.afe.choice_fallbacks import ChoiceFallbacks
 from rosafe.ros1.afe.published_tree import PublishedTree
@@ -70,8 +70,7 @@ class RosafeNode:
         self.finished = self._node.finished
         self._audio = AudioInput(self._warn)
         self._choices = ChoiceFallbacks(strict)
-        ring = self._audio.ring
-        self._published = PublishedTree(self._node, _workers(), self._choices, ring.captured, ring.catch_up)
+        self._published = PublishedTree(self._node, _workers(), self._choices, self._audio.ring.captured)
         self._tree = self._published.tree
         self._builder = TreeBuilder(self._tree, self._start_activity)
         self._loading = threading.Lock()  # one setup at a time, as each may connect the port to another topic
@@ -104,7 +103,7 @@ class RosafeNode:
                 check = functools.partial(self._check_creation, kind)
                 self._node.activity(kind.request, self._handler(kind), check)
         self._node.function("getSignals", self._get_signals)
-        self._node.function("getParameters", lambda _: {"parameters": responses.parameters(self._tree.processors)})
+        self._node.function("getParameters", lambda _: {"parameters": messages.parameters(self._tree.processors)})
         self._node.function("getProcessors", self._get_processors)
         self._node.function("getRepresentation", self._get_representation)
         self._node.function("getDependencies", lambda v: {"dependencies": self._tree.dependencies(v["nameProc"])})
@@ -152,7 +151,6 @@ class RosafeNode:
         if reader is None:
             activity.raise_if_interrupted()
             raise ROSAFE.error("e_noData", f"no audio from {self._audio.topic}: is bass acquiring?")
-        reader.next_output = self._published.next_output
         try:
             activity.raise_if_interrupted()
             processor = create(reader)
@@ -297,14 +295,14 @@ class RosafeNode:
     def _get_signals(self, values: dict[str, Any]) -> dict[str, Any]:
         if self._audio.ring.catch_up():
             self._tree.wait_idle(CATCH_UP_SECONDS)
-        return responses.response("getSignals", signals=responses.signals(self._tree.processors))
+        return messages.response("getSignals", signals=messages.signals(self._tree.processors))
 
     def _get_processors(self, values: dict[str, Any]) -> dict[str, Any]:
-        structs = responses.descriptions(self._tree.processors, self._node.name, self._tree.input_values)
-        return responses.response("getProcessors", processors=structs)
+        structs = messages.descriptions(self._tree.processors, self._node.name, self._tree.input_values)
+        return messages.response("getProcessors", processors=structs)
 
     def _get_representation(self, values: dict[str, Any]) -> dict[str, Any]:
-        return responses.response("getRepresentation", parts=responses.representation(self._tree.find(values["name"])))
+        return messages.response("getRepresentation", parts=messages.representation(self._tree.find(values["name"])))
 
     def _modify_parameter(self, values: dict[str, Any]) -> dict[str, Any]:
         warnings: dict[str, str] = {}

@@ -1,27 +1,54 @@
-"""The processor tree of the node: each processor is an activity, has a port, and is part of the diagnostics."""
+"""The processor tree of the node: each processor is an activity, has a port, and is part of the diagnostics.
+
+A port is a latched topic with a window that advances by one block at a time.
+"""
 
 from __future__ import annotations
 
-import math
+import functools
+import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import rospy
 
 from rosafe.audio.stream.frame_clock import LinearClock
 from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError
 from rosafe.ros1.afe.choice_fallbacks import ChoiceFallbacks
-from rosafe.ros1.afe.ports import OutputPort
+from rosafe.ros1.afe.messages import signal_fields
 from rosafe.ros1.component import serialization
 from rosafe.ros1.component.activities import Activity
 from rosafe.ros1.component.component import ComponentNode
 from rosafe.ros1.transport.publisher import NewestMessage, Publisher
 from rosafe.tree.block import Block
 from rosafe.tree.health import ProcessorHealth
-from rosafe.tree.processor import Processor, next_output
+from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Failure, Tree
 
 MAX_TIME = 2**32 - 1.0  # s since 1970, of a ROS time
+
+
+class _OutputPort(NamedTuple):
+    """The topic of a processor, and the function that publishes the newest window of its output."""
+
+    publisher: Publisher
+    publish: Callable[[], None]
+
+
+def _message_builder(processor: Processor) -> Callable[[], Any]:
+    """Return a function that returns the message of a port.
+
+    It refers to the history alone, so that removed processors are freed at once, and the message to released blocks,
+    which never change: they are serialized without a copy.
+    """
+    kind, history = processor.kind, processor.history
+    message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
+
+    def build() -> Any:
+        views, next_index, signal = history.port_window()
+        return message_class(**signal_fields(kind, views, next_index, signal.rate))
+
+    return build
 
 
 class PublishedTree:
@@ -35,8 +62,6 @@ class PublishedTree:
     choices : ChoiceFallbacks
     captured : callable
         Returns the time at which an audio frame was captured; None if it is unknown.
-    catch_up : callable
-        Called when a port gets a subscriber: blocks that have arrived should be processed.
 
     Attributes
     ----------
@@ -50,17 +75,17 @@ class PublishedTree:
         workers: int,
         choices: ChoiceFallbacks,
         captured: Callable[[int], LinearClock | None],
-        catch_up: Callable[[], object],
     ) -> None:
         self._node = node
         self._choices = choices
         self._captured = captured
-        self._catch_up = catch_up
-        self._ports: dict[Processor, OutputPort] = {}
+        self._ports: dict[Processor, _OutputPort] = {}
+        self._awaiting = threading.Lock()  # held while `Processor.awaited` is set
         self._activities: dict[Processor, Activity] = {}
-        self._input_port = self._advertise("input")
         self._time_class = serialization.message_class("rosAFE", "::rosAFE::frameTime")
         self._frame_time = node.advertise("frameTime", self._time_class)
+        self._frame_time.impl.on_change = self._await_subscribed
+        self._input_port = self._advertise("input")
         self._newest_time = NewestMessage(self._build_time)
         self._newest_frame = (0, LinearClock(0.0, 0.0, 1.0))  # of `_newest_time`
         self._meters = {kind: node.meters[ROSAFE.service(r.request).task] for kind, r in KINDS.items()}
@@ -85,32 +110,27 @@ class PublishedTree:
         if processor.error is not None:
             raise ComponentError("::genom::unkex", what=str(Failure.of(processor)))
 
-    def next_output(self, block_frames: int) -> float:
-        """Return an index of audio: blocks of `block_frames` that end before it are not needed yet.
-
-        It is infinite if no port has subscribers, and 0 if each block is needed.
-        """
-        if any(processor.observers for processor in tuple(self._ports)[:1]):  # observers are to see each block
-            return 0
-        subscribed = [processor for processor, port in tuple(self._ports.items()) if port.has_subscribers]
-        if not subscribed:
-            return 0 if self._frame_time.has_subscribers else math.inf
-        released = [processor.last_block for processor in subscribed]
-        if any(block is None or block.signal.hop <= block_frames for block in released):
-            return 0
-        return min(map(next_output, subscribed))
+    def _await_subscribed(self) -> None:
+        """Let the tree await the outputs with subscribers; for subscribers of frameTime alone, each block."""
+        with self._awaiting:
+            ports = tuple(self._ports.items())
+            subscribed = {processor for processor, port in ports if port.publisher.has_subscribers}
+            if not subscribed and self._frame_time.has_subscribers:
+                subscribed = {processor for processor, _ in ports if processor.parent is None}
+            for processor, _ in ports:
+                processor.awaited = processor in subscribed
 
     # --- events of the tree, on its threads ---
 
     def on_added(self, processor: Processor) -> None:
         """Open the processor's port and publish zeros."""
-        if processor.kind == "input":
-            port = OutputPort(processor, self._input_port, lambda: None)
-        else:
-            publisher = self._advertise(processor.kind, processor.name)
-            port = OutputPort(processor, publisher, publisher.unregister)
+        kind = processor.kind
+        publisher = self._input_port if kind == "input" else self._advertise(kind, processor.name)
+        newest = NewestMessage(_message_builder(processor))  # is built when there is a subscriber
+        port = _OutputPort(publisher, functools.partial(publisher.publish_newest, newest))
         self._ports[processor] = port
-        self.health.added(processor, self._meters[processor.kind])
+        self._await_subscribed()
+        self.health.added(processor, self._meters[kind])
         port.publish()
 
     def on_released(self, processor: Processor, block: Block) -> None:
@@ -134,8 +154,8 @@ class PublishedTree:
         """Close the port and end the activity."""
         self.health.ended(processor)
         port = self._ports.pop(processor, None)
-        if port is not None:  # otherwise it could not be opened
-            port.close()
+        if port is not None and port.publisher is not self._input_port:  # None if it could not be opened
+            port.publisher.unregister()
         activity = self._activities.get(processor)
         if activity is not None:
             activity.interrupt("")
@@ -143,5 +163,5 @@ class PublishedTree:
     def _advertise(self, kind: str, name: str = "") -> Publisher:
         message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
         publisher = self._node.advertise(KINDS[kind].port, message_class, name)
-        publisher.impl.on_connection = self._catch_up
+        publisher.impl.on_change = self._await_subscribed
         return publisher

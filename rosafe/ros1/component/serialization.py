@@ -26,7 +26,7 @@ from rosafe import interface
 from rosafe.declarations.idl import SCALARS, element
 from rosafe.declarations.signals import LEVELS
 from rosafe.ros1.component import generate
-from rosafe.tree.sliding_window import WindowView
+from rosafe.tree.history import WindowView
 
 Members = tuple[tuple[str, str], ...]  # name and IDL type of each member of a struct
 

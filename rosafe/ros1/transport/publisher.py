@@ -101,7 +101,7 @@ class _Topic(topics._PublisherImpl):
 
     def __init__(self, name: str, data_class: Any) -> None:
         super().__init__(name, data_class)
-        self.on_connection: Callable[[], None] = lambda: None  # called for each new subscriber
+        self.on_change: Callable[[], None] = lambda: None  # called when a subscriber has connected or disconnected
         self.connection_poll.poller.close()
         self.connection_poll = _Poller()
 
@@ -125,13 +125,14 @@ class _Topic(topics._PublisherImpl):
                 raise
             return False
         finally:
-            self.on_connection()
+            self.on_change()
             if self.closed:  # meanwhile; rospy would leave the subscriber waiting
                 sender.end()
 
     def remove_connection(self, connection: Any) -> None:
         """Remove a subscriber; rospy's method also notifies listeners, which are not used, and fails at shutdown."""
         topics._TopicImpl.remove_connection(self, connection)
+        self.on_change()
 
     def publish(self, message: Any, connection_override: Any = None) -> None:
         """Keep `message` for later subscribers, and send it to the present ones (or to one connection)."""

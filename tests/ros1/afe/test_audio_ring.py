@@ -410,8 +410,7 @@ def test_unobserved_blocks_are_read_together() -> None:
     feed(source.message())
     reader, woken, got = opened(ring, block), [], list[int]()
     observed = False
-    reader.next_output = lambda _: 0 if observed else math.inf
-    reader.open(lambda: woken.append(source.index))
+    reader.open(lambda: woken.append(source.index), lambda: 0 if observed else math.inf)
 
     def play(frames: int) -> None:
         for _ in range(frames // 4):
@@ -430,10 +429,10 @@ def test_unobserved_blocks_are_read_together() -> None:
     assert (woken, reader.waiting) == ([], True)
     play(16)
     assert woken == [96, 100, 104, 108], "12 blocks are 0.096 s"
-    assert (reader.waiting, read(), reader.waiting, read()) == (False, 96, True, 8), "at most 12 blocks at once"
+    assert (reader.waiting, read(), reader.waiting, read()) == (False, 96, True, 0), "at most 12 blocks at once"
     play(16)
     assert (woken[4:], ring.catch_up(), woken[4:]) == ([], True, [124])
-    assert (reader.waiting, read(), reader.waiting) == (False, 16, True)
+    assert (reader.waiting, read(), reader.waiting) == (False, 24, True)
     assert not ring.catch_up(), "less than a block"
     observed = True
     play(16)
@@ -451,6 +450,23 @@ def test_unobserved_blocks_are_read_together() -> None:
     assert reader.waiting
 
 
+def test_blocks_are_read_until_an_awaited_output_can_be_complete() -> None:
+    ring, block = AudioRing(print), 8
+    feed, source = ring.connect(), Source(rate=1000, window=2 * block)
+    feed(source.message())
+    reader, woken = opened(ring, block), list[int]()
+    required, at_once = 20, list[int]()
+    reader.open(lambda: woken.append(source.index), lambda: required)
+    for _ in range(20):
+        source.index += 4
+        feed(source.message())
+        while (found := reader.read()) is not None:
+            at_once.append(found[0].shape[1])
+            required = max(required, 20 + 20 * (sum(at_once) // 20))  # an output for every 20 frames
+    assert woken == [24, 40, 64, 80]
+    assert at_once == [24, 16, 24, 16]
+
+
 def test_unobserved_blocks_are_read_when_the_sound_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr("rosafe.audio.stream.ring.time.monotonic", lambda: now)
@@ -458,7 +474,7 @@ def test_unobserved_blocks_are_read_when_the_sound_pauses(monkeypatch: pytest.Mo
     feed, source = ring.connect(), Source(rate=1000, window=16)
     feed(source.message())
     reader = opened(ring, 8)
-    reader.next_output = lambda _: math.inf
+    reader.open(lambda: None, lambda: math.inf)
     source.index = 12
     feed(source.message())
     assert reader.waiting

@@ -236,13 +236,13 @@ def test_statistics_of_the_topic_and_of_each_connection(graph: Graph) -> None:
 def test_a_disconnected_subscriber_is_removed(graph: Graph) -> None:
     graph.client()
     port = Publisher("/of_the_test/left", array_msg(TIME_DOMAIN))
-    events: list[str] = []
-    port.impl.on_connection = lambda: events.append(f"connected, {port.get_num_connections()}")
+    events: list[int] = []
+    port.impl.on_change = lambda: events.append(port.get_num_connections())
     with stalled(graph, port.resolved_name):
         wait_for(lambda: port.get_num_connections() == 1)
     wait_for(lambda: (port.publish(message(1)), port.get_num_connections() == 0)[1])
     wait_for(lambda: not [t for t in threading.enumerate() if t.name == "to /stalled"], what="end of its sender")
-    assert events == ["connected, 1"]
+    assert events == [1, 0]
     port.unregister()
 
 

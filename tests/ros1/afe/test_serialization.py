@@ -22,7 +22,7 @@ from rosafe.interface import ROSAFE
 from rosafe.ros import array_msg
 from rosafe.ros1.component import serialization
 from rosafe.ros1.transport.publisher import BufferList
-from rosafe.tree.sliding_window import SlidingWindow
+from rosafe.tree.history import SlidingWindow
 
 TIME_DOMAIN = "::rosAFE::TimeDomainSignalPortStruct"
 TIME_FREQUENCY = "::rosAFE::TimeFrequencySignalPortStruct"

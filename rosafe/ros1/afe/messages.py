@@ -1,16 +1,43 @@
-"""Responses about processors: getParameters and getSignals for the original's kinds, two services for all kinds."""
+"""Output and parameters of processors as messages: of ports, the original's services, and services for all kinds."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from rosafe.declarations import ros_names
-from rosafe.interface import CORE_REPRESENTATIONS, format_value, ros_type
+from rosafe.interface import CORE_REPRESENTATIONS, LAYOUTS, format_value, ros_type
 from rosafe.interface.rosafe import parameter_struct
-from rosafe.ros1.afe.ports import signal_fields
 from rosafe.ros1.component import serialization
+from rosafe.tree.history import WindowView
 from rosafe.tree.processor import Processor
+
+_EMPTY = WindowView([np.zeros(0)])  # for fields that a kind does not use, such as ILD's `right`
+
+
+def signal_fields(kind: str, views: Sequence[WindowView], next_index: int, rate: float) -> dict[str, Any]:
+    """Return the fields of a port message, or of an element of getSignals, for the output of a processor of `kind`.
+
+    The frame rate in the message is the rounded true rate.
+    """
+    layout = LAYOUTS[kind]
+    fields: dict[str, Any] = {
+        "sampleRate": round(rate),
+        "lastFrameIndex": next_index,
+        "framesOnPort": views[0].frames,
+    }
+    for field, part, axis in layout.counts:
+        fields[field] = views[part].shape[axis]
+    for place in layout.places:
+        view = views[place.part]
+        if place.ear is not None:
+            view = view.select(place.ear)
+        if len(view.shape) > 2:
+            view = view.swap_rows()
+        fields[place.field] = view if place.present else _EMPTY
+    return fields
 
 
 def parameters(processors: Iterable[Processor]) -> Any:
