@@ -9,7 +9,7 @@ from pathlib import Path
 import rosafe
 from rosafe.representations.registry import builtin_stages
 
-from . import BASS, citing, files, functions, reference, ros2
+from . import BASS, citing, files, functions, reference
 from .rosafe import derive
 
 ROOT = Path(__file__).parents[2]
@@ -19,7 +19,7 @@ def main(argv: list[str] | None = None) -> int:
     """Write the files and list those that changed; with ``--check`` only list them, and return 1 if there are any."""
     parser = argparse.ArgumentParser(
         prog="python3 -m rosafe.interface",
-        description="Write the .msg, .srv and .action files of ROS 1 and ROS 2, their lists in CMakeLists.txt, "
+        description="Write the .msg, .srv and .action files of ROS 1, their lists in CMakeLists.txt, "
         "docs/parameters.md, docs/citing.md, CITATION.cff and rosafe/__init__.pyi.",
         epilog="example: python3 -m rosafe.interface --check",
     )
@@ -27,7 +27,7 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     kinds = {kind: stage.REPRESENTATION for kind, stage in builtin_stages().items()}  # without the user's plugins
     components = (derive(kinds), BASS)
-    expected = files.all_files(ROOT, components) | ros2.all_files(ROOT)
+    expected = files.all_files(ROOT, components)
     expected[ROOT / "docs" / "parameters.md"] = reference.markdown(components, kinds)
     expected[ROOT / "docs" / "citing.md"] = citing.markdown(kinds)
     expected[ROOT / "CITATION.cff"] = citing.citation_file(citing.references(kinds.values(), {}))
