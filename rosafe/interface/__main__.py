@@ -20,7 +20,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python3 -m rosafe.interface",
         description="Write the .msg, .srv and .action files of ROS 1, their lists in CMakeLists.txt, "
-        "docs/parameters.md, docs/citing.md, CITATION.cff and rosafe/__init__.pyi.",
+        "docs/parameters.md, docs/citing.md and rosafe/__init__.pyi.",
         epilog="example: python3 -m rosafe.interface --check",
     )
     parser.add_argument("--check", action="store_true", help="write nothing, only list the files that are out of date")
@@ -30,7 +30,6 @@ def main(argv: list[str] | None = None) -> int:
     expected = files.all_files(ROOT, components)
     expected[ROOT / "docs" / "parameters.md"] = reference.markdown(components, kinds)
     expected[ROOT / "docs" / "citing.md"] = citing.markdown(kinds)
-    expected[ROOT / "CITATION.cff"] = citing.citation_file(citing.references(kinds.values(), {}))
     expected[ROOT / "rosafe" / "__init__.pyi"] = functions.stub(kinds, rosafe._MODULES, rosafe.__all__)
     stale = files.stale(expected)
     for path in stale:
