@@ -29,23 +29,21 @@ BASS = ComponentSpec(
             "Acquire",
             "Capture from a device and publish on Audio until stopped",
             (
-                Parameter(
+                Parameter.text(
                     "device",
-                    "string",
                     "hw:1,0",
                     "ALSA name of the sound device, file:PATH, bag:PATH, topic:/NAME, scene: or scene:FILE.yaml",
                 ),
-                Parameter(
+                Parameter.count(
                     "sampleRate",
-                    "unsigned long",
                     44100,
                     "Sample rate (Hz); 0: that of the source with file: and bag:, otherwise 44100",
                     0,
                     768000,
                     zero_is_default=False,
                 ),
-                Parameter("nFramesPerChunk", "unsigned long", 2205, "Frames in one chunk", 1, 1_000_000),
-                Parameter("nChunksOnPort", "unsigned long", 20, "Chunks in the window on the port", 1, 100_000),
+                Parameter.count("nFramesPerChunk", 2205, "Frames in one chunk", 1, 1_000_000),
+                Parameter.count("nChunksOnPort", 20, "Chunks in the window on the port", 1, 100_000),
             ),
             throws=("::bass::e_nomem", "::bass::e_device", "::bass::e_hwparams", "::bass::e_swparams"),
             activity=True,

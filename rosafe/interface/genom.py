@@ -29,8 +29,8 @@ GENOM_EXCEPTIONS: dict[str, Struct] = {
 MAX_ACTIVITIES = 256  # per task, including its permanent one; deviation: the original has at most 32
 
 _PORT_NAMES = (
-    Parameter("local", "string", REQUIRED, "Name of this component's input port"),
-    Parameter("remote", "string", REQUIRED, "Name of the topic to read, such as bass/Audio"),
+    Parameter.text("local", REQUIRED, "Name of this component's input port"),
+    Parameter.text("remote", REQUIRED, "Name of the topic to read, such as bass/Audio"),
 )
 COMMON_SERVICES = (
     Service(
@@ -43,15 +43,15 @@ COMMON_SERVICES = (
         "connect_service",
         "Connect a remote service",
         (
-            Parameter("local", "string", REQUIRED, "Name of this component's remote"),
-            Parameter("remote", "string", REQUIRED, "Name of the service to use"),
+            Parameter.text("local", REQUIRED, "Name of this component's remote"),
+            Parameter.text("remote", REQUIRED, "Name of the service to use"),
         ),
         throws=("::genom::no_such_remote", "::genom::no_such_service", "::genom::remote_io"),
     ),
     Service(
         "abort_activity",
         "End one activity",
-        (Parameter("activity", "unsigned long", REQUIRED, "Number of the activity, as genom_state shows it"),),
+        (Parameter.count("activity", REQUIRED, "Number of the activity, as genom_state shows it"),),
         throws=("::genom::no_such_activity",),
     ),
     Service("kill", "End all activities and the component"),

@@ -96,15 +96,8 @@ class Precedence(FramedStage):
         parameters=(
             replace(frame_parameters("prec")[1], minimum=MAX_LAG_SECONDS),
             frame_parameters("prec")[2],
-            Parameter(
-                "prec_maxDelaySec",
-                "double",
-                0.001,
-                "Maximum delay in cross-correlation computation (s)",
-                0.0,
-                10.0,
-                open_minimum=True,
-                unit="s",
+            Parameter.positive(
+                "prec_maxDelaySec", 0.001, "Maximum delay in cross-correlation computation (s)", 10.0, unit="s"
             ),
         ),
         derived=(Derived("prec_lags", "sequence<double>", "The lags, ascending", unit="s"),),
