@@ -1,6 +1,11 @@
 """Check the installation and report what to do about missing parts.
 
-One line for each part: `ok`, `note` (not needed by all commands, or not now), or `MISSING`."""
+One line for each part: `ok`, `note` (not needed by all commands, or not now), or `MISSING`.
+
+exit status: 0 if no required part is missing, 1 otherwise
+
+example:
+  rosafe doctor --json"""
 
 from __future__ import annotations
 
@@ -76,7 +81,6 @@ class Finding(NamedTuple):
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.epilog = "exit status: 0 if no required part is missing, 1 otherwise\n\nexample:\n  rosafe doctor --json"
 
 
 def run(options: argparse.Namespace) -> int:

@@ -2,7 +2,13 @@
 
 Channels and frames whose interaural time and level differences belong to other directions are attenuated. Azimuths are
 in degrees, left of straight ahead positive. The output is a WAV with two channels of 32-bit float samples, of the same
-length and sample rate."""
+length and sample rate.
+
+The first use of a head, sample rate and parameters takes up to a minute: a model is learned and kept in
+$XDG_CACHE_HOME/rosafe. docs/resynthesis.md describes the method and its effect.
+
+example:
+  rosafe enhance talkers.wav --azimuth 0 --head /usr/share/libmysofa/default.sofa -o front.wav"""
 
 from __future__ import annotations
 
@@ -42,12 +48,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_channels(parser)
     add_settings(parser, "rosafe process -h lists them")
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
-    parser.epilog = (
-        "The first use of a head, sample rate and parameters takes up to a minute: a model is learned and kept in\n"
-        "$XDG_CACHE_HOME/rosafe. docs/resynthesis.md describes the method and its effect.\n\n"
-        "example:\n"
-        "  rosafe enhance talkers.wav --azimuth 0 --head /usr/share/libmysofa/default.sofa -o front.wav"
-    )
 
 
 def run(options: argparse.Namespace) -> int:

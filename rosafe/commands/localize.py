@@ -8,7 +8,18 @@ Without SOUND it is the ROS node localizer: it requests the representations that
 publishes the tracked sources on localizer/sources, localizer/poses and localizer/markers (for rviz) and
 localizer/posterior at 10 Hz, and the sound of each source on localizer/streams, until Ctrl-C. The options of the node
 are also private ROS parameters: ~head, ~mirror, ~seconds, ~world_frame, ~head_frame, ~rosafe, ~connect, ~audio_delay,
-~noise, ~speech_only. With --check or --calibrate-noise it measures and ends. docs/directions.md describes it."""
+~noise, ~speech_only. With --check or --calibrate-noise it measures and ends. docs/directions.md describes it.
+
+The first use of a head, sample rate and parameters takes up to a minute: a model is learned and kept in
+$XDG_CACHE_HOME/rosafe. docs/localization.md describes the method and its accuracy.
+
+examples:
+  rosafe localize speech.wav --head /usr/share/libmysofa/default.sofa
+  rosafe localize scene.wav --head kemar.head --yaw scene.truth.csv -o scene.csv -o scene.png
+  rosafe localize --head robot.head --world-frame world --audio-delay 0.03    # the node
+  rosafe localize --head robot.head --check                                   # are the ears swapped?
+  rosafe localize walk.wav --head robot.head --check                          # is it the right head?
+  rosafe localize --head robot.head --calibrate-noise 10                      # fans and motors only"""
 
 from __future__ import annotations
 
@@ -70,17 +81,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, "rosafe process -h lists them")
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     _add_node(parser)
-    parser.epilog = (
-        "The first use of a head, sample rate and parameters takes up to a minute: a model is learned and kept in\n"
-        "$XDG_CACHE_HOME/rosafe. docs/localization.md describes the method and its accuracy.\n\n"
-        "examples:\n"
-        "  rosafe localize speech.wav --head /usr/share/libmysofa/default.sofa\n"
-        "  rosafe localize scene.wav --head kemar.head --yaw scene.truth.csv -o scene.csv -o scene.png\n"
-        "  rosafe localize --head robot.head --world-frame world --audio-delay 0.03    # the node\n"
-        "  rosafe localize --head robot.head --check                                   # are the ears swapped?\n"
-        "  rosafe localize walk.wav --head robot.head --check                          # is it the right head?\n"
-        "  rosafe localize --head robot.head --calibrate-noise 10                      # fans and motors only"
-    )
 
 
 def _add_node(parser: argparse.ArgumentParser) -> None:

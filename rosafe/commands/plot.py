@@ -3,7 +3,12 @@
 The picture is a PNG beside the input, or the file that -o names. It shows time in seconds, channels at their centre
 frequencies, and colours with their units. By default, correlations are means over the channels, and modulation
 spectrograms are those of the loudest moment; --at and --channel select others. Pitch is drawn over the ratemap, and
-onset and offset maps over the strengths."""
+onset and offset maps over the strengths.
+
+examples:
+  rosafe plot speech.wav
+  rosafe plot speech.wav -o out.png --outputs amsFeatures,itd --channel 500 --set fb_nChannels=16
+  rosafe plot speech.npz --ear left"""
 
 from __future__ import annotations
 
@@ -70,12 +75,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="draw lags, or filters, of this channel over time",
     )
     parser.add_argument("--force", action="store_true", help="replace a picture that -o does not name")
-    parser.epilog = (
-        "examples:\n"
-        "  rosafe plot speech.wav\n"
-        "  rosafe plot speech.wav -o out.png --outputs amsFeatures,itd --channel 500 --set fb_nChannels=16\n"
-        "  rosafe plot speech.npz --ear left"
-    )
 
 
 def run(options: argparse.Namespace) -> int:

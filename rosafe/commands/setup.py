@@ -3,7 +3,14 @@
 `save` writes the acquisition of bass, the topic of the port Audio, and all processors with their parents and exact
 parameters. `load` creates all of this, or changes nothing. Existing processors that are equal are reused. The setup is
 refused if a different processor has one of its names, or if bass acquires from another device. docs/setups.md describes
-the file, which can be edited by hand."""
+the file, which can be edited by hand.
+
+exit status: 0 success, 1 refused (nothing was changed), 2 wrong command line
+
+examples:
+  rosafe setup save tree.yaml
+  rosafe setup load tree.yaml
+  rosafe setup save - --full"""
 
 from __future__ import annotations
 
@@ -50,13 +57,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="maximum time to wait for master and nodes that are starting (default: 0)",
     )
     add_instance(parser)
-    parser.epilog = (
-        "exit status: 0 success, 1 refused (nothing was changed), 2 wrong command line\n\n"
-        "examples:\n"
-        "  rosafe setup save tree.yaml\n"
-        "  rosafe setup load tree.yaml\n"
-        "  rosafe setup save - --full"
-    )
 
 
 def run(options: argparse.Namespace) -> int:
