@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-from rosafe.declarations.idl import TIME
 from rosafe.declarations.parameter import Parameter
 
 from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT
-from .service import ComponentSpec, PortSpec, Service, Struct
+from .service import ComponentSpec, PortSpec, Service, read_idl
 
-BINAUDIO: dict[str, Struct] = {
-    "::binaudio::timestamp": (("sec", "unsigned long"), ("nsec", "unsigned long")),
-    "::binaudio::portStruct": (
-        ("sampleRate", "unsigned long"),
-        ("nChunksOnPort", "unsigned long"),
-        ("nFramesPerChunk", "unsigned long"),
-        ("lastFrameIndex", "unsigned long long"),
-        ("left", "sequence<long>"),
-        ("right", "sequence<long>"),
-        ("stamp", "::binaudio::timestamp"),
-    ),
-}
+_IDL = read_idl(__file__)
+BINAUDIO = _IDL["struct"]
 
 BASS = ComponentSpec(
     name="bass",
@@ -96,13 +85,5 @@ BASS = ComponentSpec(
         "e_swparams": "the device's software parameters cannot be set",
     },
     structs={**BINAUDIO, **GENOM_STATE},
-    messages={
-        "SceneTruth": (
-            ("stamp", TIME),
-            ("frameIndex", "unsigned long long"),
-            ("head_yaw", "double"),
-            ("names", "sequence<string>"),
-            ("azimuths", "sequence<double>"),
-        ),
-    },
+    messages=_IDL["message"],
 )

@@ -4,27 +4,10 @@ from __future__ import annotations
 
 from rosafe.declarations.parameter import REQUIRED, Parameter
 
-from .service import PortSpec, Service, Struct
+from .service import PortSpec, Service, read_idl
 
-GENOM_EXCEPTIONS: dict[str, Struct] = {
-    "incompatible_digest": (("client", "::genom::version"), ("server", "::genom::version")),
-    "bad_transition": (("from", "string"), ("to", "string")),
-    "interrupted": (("by", "string"),),
-    "serialization": (),
-    "too_many_activities": (),
-    "disallowed": (),
-    "no_such_inport": (),
-    "no_such_outport": (),
-    "port_io": (),
-    "no_such_remote": (),
-    "no_such_service": (),
-    "remote_io": (),
-    "no_such_activity": (),
-    "fatal": (),
-    "mwerr": (("what", "string"),),
-    "unkex": (("what", "string"),),
-    "syserr": (("code", "long"),),
-}
+_IDL = read_idl(__file__)
+GENOM_EXCEPTIONS, GENOM_STATE = _IDL["exception"], _IDL["struct"]
 
 MAX_ACTIVITIES = 256  # per task, including its permanent one; deviation: the original has at most 32
 
@@ -57,24 +40,4 @@ COMMON_SERVICES = (
     Service("kill", "End all activities and the component"),
 )
 
-GENOM_STATE: dict[str, Struct] = {
-    "::genom_state::stats": (("last", "float"), ("max", "float"), ("avg", "float")),
-    "::genom_state::rusage": (
-        ("cycles", "unsigned long"),
-        ("timings", "::genom_state::stats"),
-        ("load", "::genom_state::stats"),
-    ),
-    "::genom_state::activity": (("id", "unsigned long"), ("name", "string")),
-    "::genom_state::task": (
-        ("name", "string"),
-        ("rusage", "::genom_state::rusage"),
-        ("activity", "sequence<::genom_state::activity>"),
-    ),
-    "::genom_state::component": (
-        ("task", "sequence<::genom_state::task>"),
-        ("digest", "string"),
-        ("date", "string"),
-        ("version", "string"),
-    ),
-}
 GENOM_STATE_PORT = PortSpec("genom_state", "::genom_state::component", "Tasks and live activities of the component")

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from rosafe.declarations.block_length import DEFAULT_FRAMES_PER_BLOCK, MAX_FRAMES_PER_BLOCK
-from rosafe.declarations.idl import TIME
 from rosafe.declarations.parameter import REQUIRED, Parameter
 from rosafe.declarations.representation import Representation
 from rosafe.declarations.signals import SIGNALS, layout
@@ -15,13 +14,14 @@ from rosafe.representations.registry import CORE_KINDS
 
 from .bass import BINAUDIO
 from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT
-from .service import ComponentSpec, PortSpec, Service, Struct
+from .service import ComponentSpec, PortSpec, Service, Struct, read_idl
 
 MAX_SECONDS = 600.0  # of a port or history
 MAX_SETUP = 4 * 2**20  # characters of a setup; over HTTP, the URL length is the lower limit
 RESTORED_PARAM = "restored"  # private ROS parameter: address of the node and the processors that it restores (`--keep`)
 MAX_PARAMETERS = 2**18  # characters of the parameters of a request for a whole tree, as a ROS service
 
+_IDL = read_idl(__file__)
 Kinds = Mapping[str, Representation]  # parents first
 
 LAYOUTS = {kind: layout(representation) for kind, representation in KINDS.items()}
@@ -52,24 +52,7 @@ def _structs(kinds: Kinds) -> dict[str, Struct]:
         (kind, f"sequence<{parameter_struct(kind)}>") for kind in CORE_REPRESENTATIONS
     )
     structs["::rosAFE::dataObjSt"] = tuple((kind, f"sequence<{LAYOUTS[kind].idl}>") for kind in CORE_REPRESENTATIONS)
-    structs["::rosAFE::frameTime"] = (("stamp", TIME), ("frameIndex", "unsigned long long"), ("sampleRate", "double"))
-    structs["::rosAFE::parameterValue"] = (("name", "string"), ("value", "string"))
-    structs["::rosAFE::processor"] = (
-        *((name, "string") for name in ("name", "kind", "request", "upperDepName", "port", "topic")),
-        ("rate", "double"),
-        ("shape", "sequence<unsigned long>"),
-        ("axes", "sequence<string>"),
-        ("parameters", "sequence<::rosAFE::parameterValue>"),
-    )
-    structs["::rosAFE::representation"] = (
-        ("name", "string"),
-        ("rate", "double"),
-        ("lastFrameIndex", "unsigned long long"),
-        ("axes", "sequence<string>"),
-        ("shape", "sequence<unsigned long>"),
-        ("data", "sequence<double>"),
-    )
-    return structs
+    return {**structs, **_IDL["struct"]}
 
 
 # --- requests ---------------------------------------------------------------------------------------------------
@@ -271,34 +254,6 @@ _FUNCTIONS = (
     ),
 )
 
-# Messages of the localizer, in ROS types: their topics are not ports. Angles are in rad, left positive (REP 103).
-_LOCALIZER_MESSAGES: dict[str, Struct] = {
-    "SoundSource": (
-        ("id", "unsigned long"),
-        ("azimuth", "double"),
-        ("azimuth_std", "double"),
-        ("probability", "double"),
-        ("level", "double"),
-        ("first_seen", TIME),
-        ("last_seen", TIME),
-        ("speech", "double"),
-    ),
-    "SoundSources": (("header", "::Header"), ("sources", "sequence<::SoundSource>")),
-    "SourceAudio": (
-        ("header", "::Header"),
-        ("id", "unsigned long"),
-        ("azimuth", "double"),
-        ("sample_rate", "unsigned long"),
-        ("first_sample", "unsigned long long"),
-        ("samples", "sequence<short>"),
-    ),
-    "DirectionPosterior": (
-        ("header", "::Header"),
-        ("azimuths", "sequence<double>"),
-        ("probability", "sequence<double>"),
-    ),
-}
-
 # --- the component ----------------------------------------------------------------------------------------------
 
 
@@ -344,7 +299,7 @@ def derive(kinds: Kinds) -> ComponentSpec:
             "e_badNewValue": "a value of the wrong type or out of its range",
         },
         structs={**_structs(kinds), **BINAUDIO, **GENOM_STATE},
-        messages=_LOCALIZER_MESSAGES,
+        messages=_IDL["message"],
         client_side_services=composites,
         ros_services=_ros_services(composites),
     )
