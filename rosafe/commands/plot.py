@@ -20,17 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rosafe.commands import CommandError
-from rosafe.commands._parameters import (
-    add_float_handling,
-    add_preset,
-    add_settings,
-    clipping_warning,
-    load_result,
-    one_input,
-    parameters_of,
-    parse_settings,
-)
+from rosafe.commands import CommandError, _parameters
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs
 from rosafe.system import option_types
@@ -58,9 +48,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="NAME,...",
         help=f"outputs to draw, of {', '.join(KINDS)} (default: {','.join(_DEFAULT)} for a sound, all for a result)",
     )
-    add_settings(parser, "rosafe process -h lists them; for sounds only")
-    add_preset(parser)
-    add_float_handling(parser)
+    _parameters.add_settings(parser, "rosafe process -h lists them; for sounds only")
+    _parameters.add_preset(parser)
+    _parameters.add_float_handling(parser)
     parser.add_argument("--ear", choices=("left", "right"), help="draw one ear only")
     parser.add_argument(
         "--at",
@@ -79,7 +69,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Draw the picture."""
-    source = Path(one_input(options, "expected exactly one sound file or result"))
+    source = Path(_parameters.one_input(options, "expected exactly one sound file or result"))
     target = Path(source.with_suffix(".png") if options.to is None else options.to)
     if target.suffix.lower() != ".png":
         raise CommandError(f"-o: expected a name ending in .png, got {target}")
@@ -91,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
     from rosafe.results.view.axes import save
     from rosafe.results.view.plot import draw
 
-    names = parse_settings(options.outputs)
+    names = _parameters.parse_settings(options.outputs)
     result: Mapping[str, Any]
     try:
         if source.suffix.lower() in (*FORMATS, ".zarr"):
@@ -101,12 +91,12 @@ def run(options: argparse.Namespace) -> int:
                 raise ValueError(
                     "--set: expected a sound, got a result, which already has its parameters; name the sound instead"
                 )
-            result = load_result(source)
+            result = _parameters.load_result(source)
         else:
             sound, rate = _sound(source, not options.no_clip)
             names = check_outputs(names) if names else _default(len(sound))
             outputs = [*names, *(KINDS[name].background for name in names if KINDS[name].background)]
-            parameters = parameters_of(options.settings, options.preset)
+            parameters = _parameters.parameters_of(options.settings, options.preset)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", UserWarning)
                 result = process(sound, rate, parameters=parameters, outputs=outputs)
@@ -132,7 +122,7 @@ def _sound(path: Path, clip: bool) -> tuple[np.ndarray, int]:
             )
         sound = read_whole(file)
         if file.clipped:
-            print(f"rosafe plot: {path}: {clipping_warning(file.clipped)}", file=sys.stderr)
+            print(f"rosafe plot: {path}: {_parameters.clipping_warning(file.clipped)}", file=sys.stderr)
         return sound, file.sample_rate
 
 

@@ -34,16 +34,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO, cast
 
-from rosafe.commands import CommandError
-from rosafe.commands._parameters import (
-    add_channels,
-    add_float_handling,
-    add_preset,
-    add_settings,
-    clipping_warning,
-    parameters_of,
-    parse_settings,
-)
+from rosafe.commands import CommandError, _parameters
 from rosafe.commands._workers import Interrupted, Interrupts, TaskReport, run_parallel
 from rosafe.declarations.text import bytes_text
 from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE, Parameter
@@ -86,7 +77,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help=f"file of results, ending in {', '.join(_EXTENSIONS)}, replaced if it exists; or, for several files "
         "or if it ends in /, the folder for all results, created if necessary (default: beside each input)",
     )
-    add_settings(parser, "see below")
+    _parameters.add_settings(parser, "see below")
     parser.add_argument(
         "--outputs",
         metavar="NAME,...",
@@ -98,7 +89,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         choices=[extension[1:] for extension in _EXTENSIONS],
         help="format of results that -o does not name (default: npz)",
     )
-    add_channels(parser)
+    _parameters.add_channels(parser)
     parser.add_argument(
         "--topic", metavar="NAME", help="topic of the sound in rosbags (default: /bass/Audio, or the only one)"
     )
@@ -126,8 +117,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="complete the last frames with zeros: each framed output gets ceil(N / hop) frames",
     )
-    add_preset(parser)
-    add_float_handling(parser)
+    _parameters.add_preset(parser)
+    _parameters.add_float_handling(parser)
     kept = parser.add_mutually_exclusive_group()
     kept.add_argument(
         "--resume", action="store_true", help="continue an interrupted run: keep results that are complete"
@@ -246,8 +237,8 @@ def _plan(inputs: list[Path], folder: Path | None, file: Path | None, options: a
     from rosafe.processing.files import OUTPUTS
     from rosafe.results.formats import FORMATS, check_format, format_of
 
-    parameters = parameters_of(options.settings, options.preset)
-    outputs = check_outputs(OUTPUTS if options.outputs is None else parse_settings(options.outputs))
+    parameters = _parameters.parameters_of(options.settings, options.preset)
+    outputs = check_outputs(OUTPUTS if options.outputs is None else _parameters.parse_settings(options.outputs))
     for text in warnings_of(parameters, outputs):
         print(f"rosafe process: {text}", file=sys.stderr)
     file_format = FORMATS[f".{options.format or 'npz'}"] if file is None else format_of(file)
@@ -410,7 +401,7 @@ class _Corpus:
             if done.remark:
                 self.display.message(f"rosafe process: {done.remark}")
             if done.clipped:
-                self.display.message(f"rosafe process: {source}: {clipping_warning(done.clipped)}")
+                self.display.message(f"rosafe process: {source}: {_parameters.clipping_warning(done.clipped)}")
             if done.empty:
                 self.display.message(f"rosafe process: {source}: {no_frames(done.empty, False, '--pad')}")
             text = f"{source} -> {target}: {done.seconds:.1f} s of sound, {bytes_text(done.size)}"

@@ -37,10 +37,6 @@ _SETTINGS = [p for p in REQUEST.parameters if p.name not in ("representation", "
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.usage = (
-        "rosafe request REPRESENTATION [NAME=VALUE ...] [--connect TOPIC] [-i INSTANCE] [--json]\n"
-        "       rosafe request -h"
-    )
     words = ", ".join(REQUEST.parameter("representation").choices)
     parser.add_argument("representation", metavar="REPRESENTATION", help=f"one of {words}")
     parser.add_argument(

@@ -35,11 +35,6 @@ from rosafe.tree.setups import LOCALIZER_FILES, Setup, SetupError, read, write
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.usage = (
-        "rosafe setup save FILE.yaml [--full] [--wait SECONDS] [-i INSTANCE]\n"
-        "       rosafe setup load FILE.yaml [--keep FILE] [--wait SECONDS] [-i INSTANCE]\n"
-        "       rosafe setup -h"
-    )
     parser.add_argument("action", choices=("save", "load"), help="action")
     parser.add_argument("file", metavar="FILE.yaml", help="the setup; - means standard output or input")
     parser.add_argument("--full", action="store_true", help="save: also write parameters with default values")

@@ -37,10 +37,6 @@ POLL_SECONDS = 1.0  # between two queries of the state of all nodes
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.usage = (
-        "rosafe up [FILE.yaml] [--device DEVICE] [--localize] [--head FILE] [--[no-]mirror] [--live] [--keep FILE]\n"
-        "                 [--port PORT] [--live-port PORT] [--no-browser]"
-    )
     parser.add_argument("file", metavar="FILE.yaml", nargs="?", help="the setup to load (default: none)")
     parser.add_argument("--device", metavar="DEVICE", help="capture from DEVICE, instead of the sound of FILE.yaml")
     parser.add_argument(

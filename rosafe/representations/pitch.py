@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from rosafe.declarations.parameter import Parameter
@@ -233,14 +234,7 @@ def running_maximum(before: FloatArray, values: FloatArray, reach: int) -> tuple
 
     No value is below 0. `before` (2, n) are the values before the first.
     """
-    past = before[:, max(0, before.shape[1] - reach + 1) :]
-    past = np.concatenate((np.zeros((len(past), reach - 1 - past.shape[1])), past, values), axis=1)
-    greatest = np.empty(values.shape)
-    for first in range(0, values.shape[1], reach):
-        part = slice(first, first + reach)
-        greatest[:, part] = np.maximum.accumulate(values[:, part], axis=1)
-        # the maximum from each earlier value to the last of them
-        ends = np.maximum.accumulate(past[:, first : first + reach - 1][:, ::-1], axis=1)[:, ::-1]
-        both = greatest[:, part][:, : reach - 1]
-        np.maximum(both, ends[:, : both.shape[1]], out=both)
-    return np.concatenate((before, values), axis=1)[:, -reach:], greatest
+    joined = np.concatenate((before, values), axis=1)
+    # the window of each value ends with it
+    greatest = scipy.ndimage.maximum_filter1d(joined, reach, axis=1, mode="constant", origin=(reach - 1) // 2)
+    return joined[:, -reach:], greatest[:, before.shape[1] :]
