@@ -23,7 +23,7 @@ import queue
 import re
 import sys
 import time
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,8 +102,7 @@ def _compute(path: Path, seconds: float, block: int) -> list[Event]:
 
     tracer = Tracer()
     try:
-        sound = AudioFile(path)
-        try:
+        with closing(AudioFile(path)) as sound:
             if sound.channels != 2:
                 raise CommandError(f"{path}: expected two channels, left and right ear, got {sound.channels}")
             if sound.remark:
@@ -114,8 +113,6 @@ def _compute(path: Path, seconds: float, block: int) -> list[Event]:
             with Chain(blocks, sound.sample_rate, values, CORE_REPRESENTATIONS, lambda *_: None) as chain:
                 chain.observe(tracer)
                 chain.run()
-        finally:
-            sound.close()
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
     return tracer.take()
