@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_channels, add_mirror, add_settings, head_of, one_input, parameters_of
+from rosafe.commands._parameters import add_channels, add_head, add_settings, head_of, one_input, parameters_of
 from rosafe.system import option_types
 from rosafe.system.output import check_target, write_files
 
@@ -37,13 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="DEG",
         help="direction of the wanted sound",
     )
-    parser.add_argument(
-        "--head",
-        metavar="FILE",
-        default="sphere",
-        help="SOFA file, a model that `rosafe head learn` has written, or pair:SPACING in m (default: a sphere)",
-    )
-    add_mirror(parser)
+    add_head(parser)
     parser.add_argument("-o", "--to", dest="to", metavar="OUT.wav", required=True, help="the enhanced sound")
     add_channels(parser)
     add_settings(parser, "rosafe process -h lists them")
@@ -63,13 +57,8 @@ def run(options: argparse.Namespace) -> int:
 
     try:
         sound, rate = read_ears(source, options.channels)
-        enhanced = enhance(
-            sound,
-            rate,
-            options.azimuth,
-            head_of(options.head, options.mirror),
-            parameters_of(options.settings) or None,
-        )
+        parameters = parameters_of(options.settings) or None
+        enhanced = enhance(sound, rate, options.azimuth, head_of(options), parameters)
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
     _write(target, enhanced, rate, options.force)

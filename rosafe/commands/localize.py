@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import Any
 
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_channels, add_mirror, add_settings, head_of, parameters_of
+from rosafe.commands._parameters import add_channels, add_head, add_settings, head_of, parameters_of
 from rosafe.system import option_types
 from rosafe.system.missing import require
 from rosafe.system.output import OutputError, check_target, write_files
@@ -55,13 +55,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "                       [--name NAME] [-b] [--wait] [NAME:=VALUE ...]"
     )
     parser.add_argument("inputs", nargs="*", metavar="SOUND", help="sound file or rosbag with two ears")
-    parser.add_argument(
-        "--head",
-        metavar="FILE",
-        help="SOFA file, a model that `rosafe head learn` has written, or pair:SPACING, two microphones without a head "
-        "and their distance in m (default: a sphere); sphere and pair cannot distinguish front from back",
-    )
-    add_mirror(parser)
+    add_head(parser)
     parser.add_argument(
         "--seconds",
         type=option_types.seconds(0.01, 60.0),
@@ -168,7 +162,7 @@ def _check_file(path: str, options: argparse.Namespace) -> int:
 
     try:
         sound, rate = read_ears(path, options.channels)
-        head = head_of(options.head or "sphere", options.mirror)
+        head = head_of(options)
         report = check_sound(sound, rate, head, parameters_of(options.settings) or None)
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
@@ -197,7 +191,7 @@ def _localize(path: str, options: argparse.Namespace) -> int:
             result = localize(
                 sound,
                 rate,
-                head_of(options.head or "sphere", options.mirror),
+                head_of(options),
                 options.seconds or 0.5,
                 parameters_of(options.settings) or None,
                 head_yaw=yaw,
