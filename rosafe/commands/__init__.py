@@ -1,9 +1,9 @@
 """The subcommands of `rosafe`, one module each; a module's name is the command's.
 
-A command is a module with a docstring and two functions. `rosafe -h` shows the first line of the docstring, and the
-command's own help begins with all of it::
+A command is a module with a docstring and two functions. `rosafe -h` shows the first line of the docstring. The
+command's own help begins with it, and ends with its paragraphs from `exit status:` or `examples:` on::
 
-    def configure(parser: argparse.ArgumentParser) -> None:   # adds arguments; may set `parser.epilog`
+    def configure(parser: argparse.ArgumentParser) -> None:   # adds arguments
     def run(options: argparse.Namespace) -> int:              # runs the command; returns the exit code
 
 `configure` may call `parser.set_defaults(interspersed=[])`; `run` then finds the positional arguments that follow an

@@ -9,6 +9,7 @@ import importlib.util
 import inspect
 import os
 import pkgutil
+import re
 import sys
 import warnings
 from pathlib import Path
@@ -111,10 +112,12 @@ def _add(subparsers: argparse._SubParsersAction[Parser], name: str) -> None:
         subparsers.add_parser(name, help=why, add_help=False).set_defaults(missing=why)
         return
     text = inspect.getdoc(module) or ""
+    description, *ends = re.split(r"\n\n(?=exit status:|examples?:)", text, maxsplit=1)
     subparser = subparsers.add_parser(
         name.replace("_", "-"),
         help=_summary(text),
-        description=text,
+        description=description,
+        epilog="".join(ends),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )

@@ -54,8 +54,20 @@ def add_mirror(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def head_of(head: str, mirror: bool | None) -> Any:
+def add_head(parser: argparse.ArgumentParser) -> None:
+    """Add --head, --mirror and --no-mirror."""
+    parser.add_argument(
+        "--head",
+        metavar="FILE",
+        help="SOFA file, a model that `rosafe head learn` has written, or pair:SPACING, two microphones without a head "
+        "and their distance in m (default: a sphere); sphere and pair cannot distinguish front from back",
+    )
+    add_mirror(parser)
+
+
+def head_of(options: argparse.Namespace) -> Any:
     """Return the head of --head and --mirror for `rosafe.localize`; ValueError if they do not fit together."""
+    head, mirror = options.head or "sphere", options.mirror
     if mirror is None:
         return head
     if not head.lower().endswith(".sofa"):

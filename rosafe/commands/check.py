@@ -2,7 +2,12 @@
 
 The stages are tested with blocks of different lengths, at the limits of all parameters, with silence, loud and long
 sound, and so on. Their cost is compared with that of the built-in representations. The tests run in child processes
-with all plugins that ROSAFE_PLUGINS names, because one of these may be the parent."""
+with all plugins that ROSAFE_PLUGINS names, because one of these may be the parent.
+
+exit status: 0 if the plugin can be used (there may be warnings), 1 if not
+
+example:
+  rosafe check zerocrossings.py"""
 
 from __future__ import annotations
 
@@ -18,10 +23,6 @@ from rosafe.system.terminal import printable
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("file", metavar="FILE", help="a Python file with one or more representations")
-    parser.epilog = (
-        "exit status: 0 if the plugin can be used (there may be warnings), 1 if not\n\n"
-        "example:\n  rosafe check zerocrossings.py"
-    )
 
 
 def run(options: argparse.Namespace) -> int:

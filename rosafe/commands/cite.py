@@ -1,7 +1,11 @@
 """Print a paragraph for a methods section, with the publications of the representations in use.
 
 With a result of `rosafe process` the paragraph contains its version, sample rate and parameters. With --outputs it is
-about these representations and their parents. With neither it is about the software only."""
+about these representations and their parents. With neither it is about the software only.
+
+examples:
+  rosafe cite speech.npz
+  rosafe cite --outputs ratemap,ild --set ihc_method=breebart --bibtex"""
 
 from __future__ import annotations
 
@@ -19,9 +23,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--outputs", metavar="NAME,...", help="representations, instead of those of a result")
     add_settings(parser, "rosafe process -h lists them; with --outputs only")
     parser.add_argument("--bibtex", action="store_true", help="print the publications as BibTeX entries")
-    parser.epilog = (
-        "examples:\n  rosafe cite speech.npz\n  rosafe cite --outputs ratemap,ild --set ihc_method=breebart --bibtex"
-    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,7 +1,13 @@
 """Run both nodes on a private ROS master for some seconds, and save a figure of the sound and its directions.
 
 The nodes are started as by `rosafe up`. All ports are recorded, and the directions come from the recorded sound. The
-numbers of messages and lost frames and the direction of the source are printed. No running master or node is used."""
+numbers of messages and lost frames and the direction of the source are printed. No running master or node is used.
+
+examples:
+  rosafe demo                               the built-in scene; scripts/demo installs what is missing first
+  scripts/demo 'scene:?rt60=0.4'            the same in a room with a reverberation time of 0.4 s
+  scripts/demo speech.wav --seconds 5       a sound file with two channels
+  scripts/demo plughw:1,0 --out /tmp/me     a microphone pair"""
 
 from __future__ import annotations
 
@@ -39,13 +45,6 @@ PLOTTED = {"ratemap": ("left", "right"), "ild": (None,), "crossCorrelation": (No
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.epilog = (
-        "examples:\n"
-        "  rosafe demo                               the built-in scene; scripts/demo installs what is missing first\n"
-        "  scripts/demo 'scene:?rt60=0.4'            the same in a room with a reverberation time of 0.4 s\n"
-        "  scripts/demo speech.wav --seconds 5       a sound file with two channels\n"
-        "  scripts/demo plughw:1,0 --out /tmp/me     a microphone pair"
-    )
     parser.add_argument(
         "sound",
         nargs="?",

@@ -1,6 +1,11 @@
 """Check the installation and report what to do about missing parts.
 
-One line for each part: `ok`, `note` (not needed by all commands, or not now), or `MISSING`."""
+One line for each part: `ok`, `note` (not needed by all commands, or not now), or `MISSING`.
+
+exit status: 0 if no required part is missing, 1 otherwise
+
+example:
+  rosafe doctor --json"""
 
 from __future__ import annotations
 
@@ -14,7 +19,7 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,32 +34,13 @@ from rosafe.system.terminal import printable
 OK, NOTE, MISSING = "ok", "note", "MISSING"
 
 PYTHON = "/usr/bin/python3"  # the Python of Debian's ROS packages
-# Installed by scripts/install: Python module -> Debian package.
-_ROS = {
-    "rospy": "python3-rospy",
-    "rosgraph": "python3-rosgraph",
-    "genpy": "python3-genpy",
-    "genmsg": "python3-genmsg",
-    "actionlib": "python3-actionlib",
-    "rosbag": "python3-rosbag",
-    "diagnostic_updater": "python3-diagnostic-updater",
-    "std_msgs.msg": "python3-std-msgs",
-    "actionlib_msgs.msg": "python3-actionlib-msgs",
-    "diagnostic_msgs.msg": "python3-diagnostic-msgs",
-}
-_ROS_COMMANDS = {
-    "roscore": "python3-roslaunch",
-    "rosservice": "python3-rosservice",
-    "rostopic": "python3-rostopic",
-    "rosmsg": "python3-rosmsg",
-    "rosnode": "python3-rosnode",
-}
-_NUMBERS = {"numpy": "python3-numpy", "scipy.signal": "python3-scipy", "tqdm": "python3-tqdm"}
-_SOUND_FILES = {"soundfile": "python3-soundfile"}
-_PLOTS = {"matplotlib": "python3-matplotlib"}
-_HTTP = {"aiohttp": "python3-aiohttp"}
-_TCL = {"tkinter": "python3-tk"}
-_TCL_COMMANDS = {"tclsh": "tcl"}
+# Installed by scripts/install
+_ROS = (
+    *("rospy", "rosgraph", "genpy", "genmsg", "actionlib", "rosbag", "diagnostic_updater"),
+    *("std_msgs.msg", "actionlib_msgs.msg", "diagnostic_msgs.msg"),
+)
+_ROS_COMMANDS = ("roscore", "rosservice", "rostopic", "rosmsg", "rosnode")
+_PACKAGES = {"roscore": "python3-roslaunch", "tkinter": "python3-tk", "tclsh": "tcl"}  # of Debian, with other names
 _EXTRAS = ("h5py", "xarray", "distributed")  # needed only by the formats and commands of the same names
 # In a process of its own: the packages of ROS 1 in this one have the same names.
 _ROS2 = """
@@ -76,7 +62,6 @@ class Finding(NamedTuple):
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.epilog = "exit status: 0 if no required part is missing, 1 otherwise\n\nexample:\n  rosafe doctor --json"
 
 
 def run(options: argparse.Namespace) -> int:
@@ -121,27 +106,33 @@ def _install_command() -> str:
     )
 
 
-def _needs(modules: dict[str, str], commands: dict[str, str] | None = None) -> Finding:
-    """Check that modules can be imported and commands exist; each is mapped to its Debian package."""
+def _needs(modules: Sequence[str], commands: Sequence[str] = ()) -> Finding:
+    """Check that modules can be imported and commands exist."""
     found, wrong = [], []
-    for name, package in modules.items():
+    for name in modules:
         try:
             importlib.import_module(name)
         except Exception as problem:  # a broken dependency may raise any exception
-            wrong.append(f"{name} ({package}): {' '.join(str(problem).split())}")
+            wrong.append(f"{name} ({_package(name)}): {' '.join(str(problem).split())}")
         else:
             top = name.partition(".")[0]
             version = getattr(sys.modules[top], "__version__", "")
             found.append(f"{top} {version}".rstrip())
-    for name, package in (commands or {}).items():
+    for name in commands:
         if shutil.which(name, path=f"{os.environ.get('PATH', '')}:/usr/bin"):
             found.append(name)
         else:
-            wrong.append(f"{name} ({package})")
+            wrong.append(f"{name} ({_package(name)})")
     if wrong:
-        todo = missing.install(next(iter(modules))) if missing.by_pip() else _install_command()
-        return Finding(MISSING, "; ".join(wrong), todo)
+        return Finding(
+            MISSING, "; ".join(wrong), missing.install(modules[0]) if missing.by_pip() else _install_command()
+        )
     return Finding(OK, ", ".join(found))
+
+
+def _package(name: str) -> str:
+    """Return Debian's package of a module or a command."""
+    return _PACKAGES.get(name, f"python3-{name.partition('.')[0].replace('_', '-')}")
 
 
 def _python() -> Finding:
@@ -268,10 +259,10 @@ def _address() -> Finding:
 
 CHECKS: dict[str, Callable[[], Finding]] = {
     "python": _python,
-    "numbers": lambda: _needs(_NUMBERS),
+    "numbers": lambda: _needs(["numpy", "scipy.signal", "tqdm"]),
     "kernels": _kernels,
     "plugins": _plugins,
-    "sound files": lambda: _needs(_SOUND_FILES),
+    "sound files": lambda: _needs(["soundfile"]),
     "ROS": lambda: _needs(_ROS, _ROS_COMMANDS),
     "messages": _messages,
     "ROS 2": _ros2,
@@ -280,8 +271,8 @@ CHECKS: dict[str, Callable[[], Finding]] = {
     "alsaaudio": _alsaaudio,
     "speech": _speech,
     "sound devices": _devices,
-    "HTTP server": lambda: _needs(_HTTP),
-    "Tcl": lambda: _needs(_TCL, _TCL_COMMANDS),
-    "plots": lambda: _needs(_PLOTS),
+    "HTTP server": lambda: _needs(["aiohttp"]),
+    "Tcl": lambda: _needs(["tkinter"], ["tclsh"]),
+    "plots": lambda: _needs(["matplotlib"]),
     "extras": _extras,
 }

@@ -2,7 +2,13 @@
 
 Channels and frames whose interaural time and level differences belong to other directions are attenuated. Azimuths are
 in degrees, left of straight ahead positive. The output is a WAV with two channels of 32-bit float samples, of the same
-length and sample rate."""
+length and sample rate.
+
+The first use of a head, sample rate and parameters takes up to a minute: a model is learned and kept in
+$XDG_CACHE_HOME/rosafe. docs/resynthesis.md describes the method and its effect.
+
+example:
+  rosafe enhance talkers.wav --azimuth 0 --head /usr/share/libmysofa/default.sofa -o front.wav"""
 
 from __future__ import annotations
 
@@ -12,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_channels, add_mirror, add_settings, head_of, one_input, parameters_of
+from rosafe.commands._parameters import add_channels, add_head, add_settings, head_of, one_input, parameters_of
 from rosafe.system import option_types
 from rosafe.system.output import check_target, write_files
 
@@ -31,23 +37,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="DEG",
         help="direction of the wanted sound",
     )
-    parser.add_argument(
-        "--head",
-        metavar="FILE",
-        default="sphere",
-        help="SOFA file, a model that `rosafe head learn` has written, or pair:SPACING in m (default: a sphere)",
-    )
-    add_mirror(parser)
+    add_head(parser)
     parser.add_argument("-o", "--to", dest="to", metavar="OUT.wav", required=True, help="the enhanced sound")
     add_channels(parser)
     add_settings(parser, "rosafe process -h lists them")
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
-    parser.epilog = (
-        "The first use of a head, sample rate and parameters takes up to a minute: a model is learned and kept in\n"
-        "$XDG_CACHE_HOME/rosafe. docs/resynthesis.md describes the method and its effect.\n\n"
-        "example:\n"
-        "  rosafe enhance talkers.wav --azimuth 0 --head /usr/share/libmysofa/default.sofa -o front.wav"
-    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -63,13 +57,8 @@ def run(options: argparse.Namespace) -> int:
 
     try:
         sound, rate = read_ears(source, options.channels)
-        enhanced = enhance(
-            sound,
-            rate,
-            options.azimuth,
-            head_of(options.head, options.mirror),
-            parameters_of(options.settings) or None,
-        )
+        parameters = parameters_of(options.settings) or None
+        enhanced = enhance(sound, rate, options.azimuth, head_of(options), parameters)
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
     _write(target, enhanced, rate, options.force)

@@ -3,7 +3,11 @@
 pair:SPACING, such as pair:0.058, is two microphones with this distance in m and without a head.
 RECORDINGS.csv has the columns file, azimuth_deg: sound files with two ears of one source at a known direction each,
 left positive. The directions must surround the head, at most 30 degrees apart; several files for one direction are
-allowed."""
+allowed.
+
+example:
+  rosafe head learn /usr/share/libmysofa/default.sofa -o kemar.head
+  rosafe localize speech.wav --head kemar.head"""
 
 from __future__ import annotations
 
@@ -39,11 +43,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_mirror(parser)
     add_settings(parser, "rosafe process -h lists them")
     parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
-    parser.epilog = (
-        "example:\n"
-        "  rosafe head learn /usr/share/libmysofa/default.sofa -o kemar.head\n"
-        "  rosafe localize speech.wav --head kemar.head"
-    )
 
 
 def _action(text: str) -> str:

@@ -3,7 +3,11 @@
 Prints a URL with a token. The page shows the cochleagrams of both ears, level differences, the direction of the source,
 levels, losses and loads. It can add representations, change parameters, and start and stop the sound. All files come
 from this server, so that no Internet access is needed. The server joins the ROS graph of bass and rosAFE, and
-subscribes only to ports that are displayed."""
+subscribes only to ports that are displayed.
+
+examples:
+  rosafe live
+  rosafe live --host 0.0.0.0 --watch --no-browser    # for the network of the robot; see docs/security.md"""
 
 from __future__ import annotations
 
@@ -31,11 +35,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--images", action="store_true", help="also publish images for rviz (sensor_msgs/Image)")
     add_instance(parser)
     parser.add_argument("--bass", metavar="NAME", help="name of the bass node (default: bass beside the rosAFE node)")
-    parser.epilog = (
-        "examples:\n"
-        "  rosafe live\n"
-        "  rosafe live --host 0.0.0.0 --watch --no-browser    # for the network of the robot; see docs/security.md"
-    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -8,7 +8,18 @@ Without SOUND it is the ROS node localizer: it requests the representations that
 publishes the tracked sources on localizer/sources, localizer/poses and localizer/markers (for rviz) and
 localizer/posterior at 10 Hz, and the sound of each source on localizer/streams, until Ctrl-C. The options of the node
 are also private ROS parameters: ~head, ~mirror, ~seconds, ~world_frame, ~head_frame, ~rosafe, ~connect, ~audio_delay,
-~noise, ~speech_only. With --check or --calibrate-noise it measures and ends. docs/directions.md describes it."""
+~noise, ~speech_only. With --check or --calibrate-noise it measures and ends. docs/directions.md describes it.
+
+The first use of a head, sample rate and parameters takes up to a minute: a model is learned and kept in
+$XDG_CACHE_HOME/rosafe. docs/localization.md describes the method and its accuracy.
+
+examples:
+  rosafe localize speech.wav --head /usr/share/libmysofa/default.sofa
+  rosafe localize scene.wav --head kemar.head --yaw scene.truth.csv -o scene.csv -o scene.png
+  rosafe localize --head robot.head --world-frame world --audio-delay 0.03    # the node
+  rosafe localize --head robot.head --check                                   # are the ears swapped?
+  rosafe localize walk.wav --head robot.head --check                          # is it the right head?
+  rosafe localize --head robot.head --calibrate-noise 10                      # fans and motors only"""
 
 from __future__ import annotations
 
@@ -22,7 +33,7 @@ from pathlib import Path
 from typing import Any
 
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_channels, add_mirror, add_settings, head_of, parameters_of
+from rosafe.commands._parameters import add_channels, add_head, add_settings, head_of, parameters_of
 from rosafe.system import option_types
 from rosafe.system.missing import require
 from rosafe.system.output import OutputError, check_target, write_files
@@ -44,13 +55,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "                       [--name NAME] [-b] [--wait] [NAME:=VALUE ...]"
     )
     parser.add_argument("inputs", nargs="*", metavar="SOUND", help="sound file or rosbag with two ears")
-    parser.add_argument(
-        "--head",
-        metavar="FILE",
-        help="SOFA file, a model that `rosafe head learn` has written, or pair:SPACING, two microphones without a head "
-        "and their distance in m (default: a sphere); sphere and pair cannot distinguish front from back",
-    )
-    add_mirror(parser)
+    add_head(parser)
     parser.add_argument(
         "--seconds",
         type=option_types.seconds(0.01, 60.0),
@@ -70,17 +75,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, "rosafe process -h lists them")
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     _add_node(parser)
-    parser.epilog = (
-        "The first use of a head, sample rate and parameters takes up to a minute: a model is learned and kept in\n"
-        "$XDG_CACHE_HOME/rosafe. docs/localization.md describes the method and its accuracy.\n\n"
-        "examples:\n"
-        "  rosafe localize speech.wav --head /usr/share/libmysofa/default.sofa\n"
-        "  rosafe localize scene.wav --head kemar.head --yaw scene.truth.csv -o scene.csv -o scene.png\n"
-        "  rosafe localize --head robot.head --world-frame world --audio-delay 0.03    # the node\n"
-        "  rosafe localize --head robot.head --check                                   # are the ears swapped?\n"
-        "  rosafe localize walk.wav --head robot.head --check                          # is it the right head?\n"
-        "  rosafe localize --head robot.head --calibrate-noise 10                      # fans and motors only"
-    )
 
 
 def _add_node(parser: argparse.ArgumentParser) -> None:
@@ -168,7 +162,7 @@ def _check_file(path: str, options: argparse.Namespace) -> int:
 
     try:
         sound, rate = read_ears(path, options.channels)
-        head = head_of(options.head or "sphere", options.mirror)
+        head = head_of(options)
         report = check_sound(sound, rate, head, parameters_of(options.settings) or None)
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
@@ -197,7 +191,7 @@ def _localize(path: str, options: argparse.Namespace) -> int:
             result = localize(
                 sound,
                 rate,
-                head_of(options.head or "sphere", options.mirror),
+                head_of(options),
                 options.seconds or 0.5,
                 parameters_of(options.settings) or None,
                 head_yaw=yaw,

@@ -3,7 +3,12 @@
 The picture is a PNG beside the input, or the file that -o names. It shows time in seconds, channels at their centre
 frequencies, and colours with their units. By default, correlations are means over the channels, and modulation
 spectrograms are those of the loudest moment; --at and --channel select others. Pitch is drawn over the ratemap, and
-onset and offset maps over the strengths."""
+onset and offset maps over the strengths.
+
+examples:
+  rosafe plot speech.wav
+  rosafe plot speech.wav -o out.png --outputs amsFeatures,itd --channel 500 --set fb_nChannels=16
+  rosafe plot speech.npz --ear left"""
 
 from __future__ import annotations
 
@@ -15,17 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rosafe.commands import CommandError
-from rosafe.commands._parameters import (
-    add_float_handling,
-    add_preset,
-    add_settings,
-    clipping_warning,
-    load_result,
-    one_input,
-    parameters_of,
-    parse_settings,
-)
+from rosafe.commands import CommandError, _parameters
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs
 from rosafe.system import option_types
@@ -53,9 +48,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="NAME,...",
         help=f"outputs to draw, of {', '.join(KINDS)} (default: {','.join(_DEFAULT)} for a sound, all for a result)",
     )
-    add_settings(parser, "rosafe process -h lists them; for sounds only")
-    add_preset(parser)
-    add_float_handling(parser)
+    _parameters.add_settings(parser, "rosafe process -h lists them; for sounds only")
+    _parameters.add_preset(parser)
+    _parameters.add_float_handling(parser)
     parser.add_argument("--ear", choices=("left", "right"), help="draw one ear only")
     parser.add_argument(
         "--at",
@@ -70,17 +65,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="draw lags, or filters, of this channel over time",
     )
     parser.add_argument("--force", action="store_true", help="replace a picture that -o does not name")
-    parser.epilog = (
-        "examples:\n"
-        "  rosafe plot speech.wav\n"
-        "  rosafe plot speech.wav -o out.png --outputs amsFeatures,itd --channel 500 --set fb_nChannels=16\n"
-        "  rosafe plot speech.npz --ear left"
-    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Draw the picture."""
-    source = Path(one_input(options, "expected exactly one sound file or result"))
+    source = Path(_parameters.one_input(options, "expected exactly one sound file or result"))
     target = Path(source.with_suffix(".png") if options.to is None else options.to)
     if target.suffix.lower() != ".png":
         raise CommandError(f"-o: expected a name ending in .png, got {target}")
@@ -92,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
     from rosafe.results.view.axes import save
     from rosafe.results.view.plot import draw
 
-    names = parse_settings(options.outputs)
+    names = _parameters.parse_settings(options.outputs)
     result: Mapping[str, Any]
     try:
         if source.suffix.lower() in (*FORMATS, ".zarr"):
@@ -102,12 +91,12 @@ def run(options: argparse.Namespace) -> int:
                 raise ValueError(
                     "--set: expected a sound, got a result, which already has its parameters; name the sound instead"
                 )
-            result = load_result(source)
+            result = _parameters.load_result(source)
         else:
             sound, rate = _sound(source, not options.no_clip)
             names = check_outputs(names) if names else _default(len(sound))
             outputs = [*names, *(KINDS[name].background for name in names if KINDS[name].background)]
-            parameters = parameters_of(options.settings, options.preset)
+            parameters = _parameters.parameters_of(options.settings, options.preset)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", UserWarning)
                 result = process(sound, rate, parameters=parameters, outputs=outputs)
@@ -133,7 +122,7 @@ def _sound(path: Path, clip: bool) -> tuple[np.ndarray, int]:
             )
         sound = read_whole(file)
         if file.clipped:
-            print(f"rosafe plot: {path}: {clipping_warning(file.clipped)}", file=sys.stderr)
+            print(f"rosafe plot: {path}: {_parameters.clipping_warning(file.clipped)}", file=sys.stderr)
         return sound, file.sample_rate
 
 

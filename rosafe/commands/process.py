@@ -4,7 +4,20 @@ Reads all formats of libsndfile (WAV, FLAC, Ogg, MP3, ...) and rosbags. A sound 
 --channels selects them. Writes one file of results beside each sound or to the path of -o; rosafe.load and rosafe plot
 read .npz and .h5. By default the framed outputs are kept: ild, ratemap and crossCorrelation.
 The results equal those of the node for the same samples, bit for bit. Therefore samples are read as 32-bit integers
-(float files are scaled by 2^31-1 and rounded), and in_doNormalize is true by default."""
+(float files are scaled by 2^31-1 and rounded), and in_doNormalize is true by default.
+
+A folder -o gets the subfolders of the input folder. Failures are printed at the end and listed in failed.csv there; the
+other files are processed. A file of results contains the outputs that are listed below, as rosafe.process returns them;
+the coordinates of their axes; KIND_time in s of each representation, KIND_frameRate in Hz of framed ones; furthermore
+sample_rate in Hz, block_frames, parameters (all values as JSON), source (name of the input), clipped (number of
+samples), rosafe_version, axes and units. A .csv file contains one output with two axes.
+
+exit status: 0 success, 1 a file failed (the others are done), 2 wrong command line, 130 interrupted
+
+examples:
+  rosafe process speech.wav --outputs ild,ratemap --set fb_nChannels=64 ihc_method=bernstein
+  rosafe process speech.flac -o speech.h5 --set fb_cfHz=500,1000,2000
+  rosafe process corpus -o results --resume"""
 
 from __future__ import annotations
 
@@ -16,22 +29,12 @@ import re
 import sys
 import textwrap
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TextIO, cast
 
-from rosafe.commands import CommandError
-from rosafe.commands._parameters import (
-    add_channels,
-    add_float_handling,
-    add_preset,
-    add_settings,
-    clipping_warning,
-    parameters_of,
-    parse_settings,
-)
-from rosafe.commands._progress import ProgressDisplay
+from rosafe.commands import CommandError, _parameters
 from rosafe.commands._workers import Interrupted, Interrupts, TaskReport, run_parallel
 from rosafe.declarations.text import bytes_text
 from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE, Parameter
@@ -44,6 +47,10 @@ _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
 _MAX_JOBS = 10_000
 _EXTENSIONS = (".npz", ".h5", ".mat", ".csv")
 _NAMED = 20  # failures that are printed at the end if failed.csv lists all of them
+LIVE_SECONDS = 0.1  # minimum time between two updates of the live line
+PLAIN_SECONDS = 10.0  # minimum time between two plain lines
+_PLAIN = "{percentage:3.0f} %{postfix}  {remaining} left"
+_LIVE = "[{bar:24}] " + _PLAIN
 
 # --- the command line -------------------------------------------------------------------------------------------
 
@@ -70,7 +77,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help=f"file of results, ending in {', '.join(_EXTENSIONS)}, replaced if it exists; or, for several files "
         "or if it ends in /, the folder for all results, created if necessary (default: beside each input)",
     )
-    add_settings(parser, "see below")
+    _parameters.add_settings(parser, "see below")
     parser.add_argument(
         "--outputs",
         metavar="NAME,...",
@@ -82,7 +89,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         choices=[extension[1:] for extension in _EXTENSIONS],
         help="format of results that -o does not name (default: npz)",
     )
-    add_channels(parser)
+    _parameters.add_channels(parser)
     parser.add_argument(
         "--topic", metavar="NAME", help="topic of the sound in rosbags (default: /bass/Audio, or the only one)"
     )
@@ -110,8 +117,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="complete the last frames with zeros: each framed output gets ceil(N / hop) frames",
     )
-    add_preset(parser)
-    add_float_handling(parser)
+    _parameters.add_preset(parser)
+    _parameters.add_float_handling(parser)
     kept = parser.add_mutually_exclusive_group()
     kept.add_argument(
         "--resume", action="store_true", help="continue an interrupted run: keep results that are complete"
@@ -120,37 +127,21 @@ def configure(parser: argparse.ArgumentParser) -> None:
     loud = parser.add_mutually_exclusive_group()
     loud.add_argument("-v", "--verbose", action="store_true", help="print a line for each file")
     loud.add_argument("-q", "--quiet", action="store_true", help="print errors only")
-    parser.epilog = _epilog()
+    parser.epilog = "\n".join([parser.epilog or "", *_declared()])
 
 
-def _epilog() -> str:
-    parts = [named for kind in KINDS.values() for named in kind.outputs.items()]
-    lines = [
-        "A file of results contains these outputs, as rosafe.process returns them:",
-        *(f"  {name} ({', '.join(part.axes)}) {part.unit}".rstrip() for name, part in parts),
-        "the coordinates of their axes:",
-        *textwrap.wrap(_coordinates(), 100, initial_indent="  ", subsequent_indent="  "),
-        "KIND_time in s of each representation, KIND_frameRate in Hz of framed ones; furthermore sample_rate in Hz,",
-        "block_frames, parameters (all values as JSON), source (name of the input), clipped (number of samples),",
-        "rosafe_version, axes and units. A .csv file contains one output with two axes.",
-        "",
-        "A folder -o gets the subfolders of the input folder. Failures are printed at the end and listed in",
-        "failed.csv there; the other files are processed.",
-        "",
-        "exit status: 0 success, 1 a file failed (the others are done), 2 wrong command line, 130 interrupted",
-        "",
-        "examples:",
-        "  rosafe process speech.wav --outputs ild,ratemap --set fb_nChannels=64 ihc_method=bernstein",
-        "  rosafe process speech.flac -o speech.h5 --set fb_cfHz=500,1000,2000",
-        "  rosafe process corpus -o results --resume",
-        "",
-        "parameters, with their defaults:",
-    ]
+def _declared() -> Iterator[str]:
+    """Yield the lines about outputs, coordinates and parameters."""
+    yield "\noutputs:"
     for kind in KINDS.values():
-        lines.append(f"  {kind.kind}")
+        yield from (f"  {name} ({', '.join(part.axes)}) {part.unit}".rstrip() for name, part in kind.outputs.items())
+    yield "\ncoordinates of their axes:"
+    yield textwrap.fill(_coordinates(), 100, initial_indent="  ", subsequent_indent="  ")
+    yield "\nparameters, with their defaults:"
+    for kind in KINDS.values():
+        yield f"  {kind.kind}"
         for parameter in kind.parameters:
-            lines += _parameter_lines(parameter)
-    return "\n".join(lines)
+            yield from _parameter_lines(parameter)
 
 
 def _coordinates() -> str:
@@ -246,8 +237,8 @@ def _plan(inputs: list[Path], folder: Path | None, file: Path | None, options: a
     from rosafe.processing.files import OUTPUTS
     from rosafe.results.formats import FORMATS, check_format, format_of
 
-    parameters = parameters_of(options.settings, options.preset)
-    outputs = check_outputs(OUTPUTS if options.outputs is None else parse_settings(options.outputs))
+    parameters = _parameters.parameters_of(options.settings, options.preset)
+    outputs = check_outputs(OUTPUTS if options.outputs is None else _parameters.parse_settings(options.outputs))
     for text in warnings_of(parameters, outputs):
         print(f"rosafe process: {text}", file=sys.stderr)
     file_format = FORMATS[f".{options.format or 'npz'}"] if file is None else format_of(file)
@@ -410,7 +401,7 @@ class _Corpus:
             if done.remark:
                 self.display.message(f"rosafe process: {done.remark}")
             if done.clipped:
-                self.display.message(f"rosafe process: {source}: {clipping_warning(done.clipped)}")
+                self.display.message(f"rosafe process: {source}: {_parameters.clipping_warning(done.clipped)}")
             if done.empty:
                 self.display.message(f"rosafe process: {source}: {no_frames(done.empty, False, '--pad')}")
             text = f"{source} -> {target}: {done.seconds:.1f} s of sound, {bytes_text(done.size)}"
@@ -464,3 +455,85 @@ class _Corpus:
 def _size(path: Path) -> float:
     """Return the weight of a file in the display: its size in bytes."""
     return float(os.path.getsize(path)) if os.path.isfile(path) else 0.0
+
+
+# --- progress: one live line on a terminal, otherwise a plain line now and then ---------------------------------------
+
+
+class ProgressDisplay:
+    """Display of the progress of several files together.
+
+    Parameters
+    ----------
+    stream : text file
+        The output; a live line is drawn if it is a terminal.
+    sizes : sequence of float
+        The weight of each file.
+    quiet : bool
+        Show messages only.
+    """
+
+    def __init__(self, stream: TextIO, sizes: Sequence[float], quiet: bool) -> None:
+        from tqdm import tqdm
+
+        tqdm.monitor_interval = 0  # no extra thread, because the command forks
+        self._stream = stream
+        self._sizes = [max(size, 1.0) for size in sizes]
+        self._fractions = [0.0] * len(sizes)
+        self._ended = self._computed = 0
+        live = stream.isatty()
+        self._bar = tqdm(
+            total=sum(self._sizes),
+            file=stream if live else _LineWriter(stream),
+            disable=quiet,
+            leave=False,
+            delay=0.0 if live else PLAIN_SECONDS,
+            mininterval=LIVE_SECONDS if live else PLAIN_SECONDS,
+            miniters=0,
+            smoothing=0,
+            dynamic_ncols=live,
+            ascii="-#",
+            bar_format=_LIVE if live else _PLAIN,
+        )
+
+    def update(self, index: int, fraction: float, last: bool = False, skipped: bool = False) -> None:
+        """Set the finished `fraction` of a file; `last` marks its end, `skipped` a file that needed no work."""
+        step = self._sizes[index] * (fraction - self._fractions[index])
+        self._fractions[index] = fraction
+        self._ended += last
+        self._computed += last and not skipped
+        if self._bar.disable:
+            return
+        if skipped:
+            self._bar.initial += self._sizes[index]  # the estimate of the remaining time ignores it
+        if len(self._sizes) > 1:
+            text = f"{self._ended} of {len(self._sizes)} files"
+            elapsed = self._bar.format_dict["elapsed"]
+            if self._computed and elapsed > 0:
+                text += f", {self._computed / elapsed:.3g} files/s"
+            self._bar.set_postfix_str(text, refresh=False)
+        self._bar.update(step)
+
+    def message(self, text: str) -> None:
+        """Write a line that remains above the live line."""
+        self._bar.clear()
+        self._stream.write(printable(text) + "\n")
+        self._stream.flush()
+
+    def close(self) -> None:
+        """Remove the live line."""
+        self._bar.close()
+
+
+class _LineWriter:
+    """Text file for tqdm that writes each new state of the bar as a line of its own."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> None:
+        if line := text.strip():
+            self._stream.write(f"{line}\n")
+
+    def flush(self) -> None:
+        self._stream.flush()

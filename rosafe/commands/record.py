@@ -3,7 +3,20 @@
 The sound comes from a running bass (topic bass/Audio), another --topic, or a --device: a sound card, file:PATH,
 bag:PATH, topic:/NAME or scene:, named as for Acquire of bass. Only topics need ROS. OUT.wav contains the exact samples
 with 32 bits; above 4 GiB it is an RF64 file, which libsndfile reads like any WAV. OUT.bag is for `rosbag play` and the
-device bag:. Lost frames are replaced by silence and reported. Ctrl-C ends the recording with a complete file."""
+device bag:. Lost frames are replaced by silence and reported. Ctrl-C ends the recording with a complete file.
+
+The meter shows for each ear the highest sample (peak) and the root mean square (rms) in dB below full
+scale, CLIP if samples reached full scale, and the number of lost frames. On a terminal it is one live
+line with bars of the rms, followed by peak/rms; otherwise a line per second.
+
+exit status: 0 recorded, 1 failure (the sound recorded until then is kept), 2 wrong command line
+
+examples:
+  rosafe record --device plughw:1,0              # check the levels of a sound card
+  rosafe record speech.wav --device plughw:1,0   # until Ctrl-C
+  rosafe record speech.bag --seconds 60          # the sound of a running bass
+  rosafe record speech.wav --device topic:/audio # the sound of another driver
+  rosafe record --calibrate 94 --device plughw:1,0"""
 
 from __future__ import annotations
 
@@ -79,18 +92,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     parser.add_argument("-q", "--quiet", action="store_true", help="no meter; print losses and the summary only")
-    parser.epilog = (
-        "The meter shows for each ear the highest sample (peak) and the root mean square (rms) in dB below full\n"
-        "scale, CLIP if samples reached full scale, and the number of lost frames. On a terminal it is one live\n"
-        "line with bars of the rms, followed by peak/rms; otherwise a line per second.\n\n"
-        "exit status: 0 recorded, 1 failure (the sound recorded until then is kept), 2 wrong command line\n\n"
-        "examples:\n"
-        "  rosafe record --device plughw:1,0              # check the levels of a sound card\n"
-        "  rosafe record speech.wav --device plughw:1,0   # until Ctrl-C\n"
-        "  rosafe record speech.bag --seconds 60          # the sound of a running bass\n"
-        "  rosafe record speech.wav --device topic:/audio # the sound of another driver\n"
-        "  rosafe record --calibrate 94 --device plughw:1,0"
-    )
 
 
 # --- recording ---------------------------------------------------------------------------------------------------

@@ -4,7 +4,15 @@ NAME=VALUE are parameters of the representation or of its ancestors; the others 
 with the same parameters are reused. The others are created with names such as ild_0, ild_1, ... If one cannot be
 created, the new ones are removed.
 
-Prints a line for each processor, from the input to the requested one: created or reused, name, topic."""
+Prints a line for each processor, from the input to the requested one: created or reused, name, topic.
+
+exit status: 0 the representation is computed, 1 refused, 2 wrong command line
+
+examples:
+  rosafe request ild
+  rosafe request pitch pi_rangeHz=80,300
+  rosafe request ratemap fb_nChannels=64 rm_wSizeSec=0.03 nFramesPerBlock=4410
+  rosafe request filterbank fb_cfHz=500,1000,2000 --json"""
 
 from __future__ import annotations
 
@@ -29,10 +37,6 @@ _SETTINGS = [p for p in REQUEST.parameters if p.name not in ("representation", "
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.usage = (
-        "rosafe request REPRESENTATION [NAME=VALUE ...] [--connect TOPIC] [-i INSTANCE] [--json]\n"
-        "       rosafe request -h"
-    )
     words = ", ".join(REQUEST.parameter("representation").choices)
     parser.add_argument("representation", metavar="REPRESENTATION", help=f"one of {words}")
     parser.add_argument(
@@ -50,14 +54,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_instance(parser)
     parser.add_argument("--json", action="store_true", help="print the response of genomixd as JSON")
     parser.set_defaults(interspersed=[])
-    parser.epilog = (
-        "exit status: 0 the representation is computed, 1 refused, 2 wrong command line\n\n"
-        "examples:\n"
-        "  rosafe request ild\n"
-        "  rosafe request pitch pi_rangeHz=80,300\n"
-        "  rosafe request ratemap fb_nChannels=64 rm_wSizeSec=0.03 nFramesPerBlock=4410\n"
-        "  rosafe request filterbank fb_cfHz=500,1000,2000 --json"
-    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,7 +1,11 @@
 """Run the node of ROS 2: sound, representations and tracked sources in one process.
 
 The process becomes that of `ros2 run rosafe_ros2 rosafe`, without a workspace: in any shell in which Python finds rclpy
-and rosafe_msgs. docs/ros2.md describes the parameters, topics and services of the node."""
+and rosafe_msgs. docs/ros2.md describes the parameters, topics and services of the node.
+
+examples:
+  rosafe ros2 --ros-args -p device:=scene: -p localize:=true
+  rosafe ros2 --ros-args -p device:=plughw:1,0 -p representations:='[ild, ratemap]' -r __ns:=/robot1"""
 
 from __future__ import annotations
 
@@ -27,11 +31,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="ARGUMENT",
         help="arguments of ROS 2: -p NAME:=VALUE sets a parameter, -r NAME:=NAME renames",
-    )
-    parser.epilog = (
-        "examples:\n"
-        "  rosafe ros2 --ros-args -p device:=scene: -p localize:=true\n"
-        "  rosafe ros2 --ros-args -p device:=plughw:1,0 -p representations:='[ild, ratemap]' -r __ns:=/robot1"
     )
 
 

@@ -3,7 +3,14 @@
 `save` writes the acquisition of bass, the topic of the port Audio, and all processors with their parents and exact
 parameters. `load` creates all of this, or changes nothing. Existing processors that are equal are reused. The setup is
 refused if a different processor has one of its names, or if bass acquires from another device. docs/setups.md describes
-the file, which can be edited by hand."""
+the file, which can be edited by hand.
+
+exit status: 0 success, 1 refused (nothing was changed), 2 wrong command line
+
+examples:
+  rosafe setup save tree.yaml
+  rosafe setup load tree.yaml
+  rosafe setup save - --full"""
 
 from __future__ import annotations
 
@@ -28,11 +35,6 @@ from rosafe.tree.setups import LOCALIZER_FILES, Setup, SetupError, read, write
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.usage = (
-        "rosafe setup save FILE.yaml [--full] [--wait SECONDS] [-i INSTANCE]\n"
-        "       rosafe setup load FILE.yaml [--keep FILE] [--wait SECONDS] [-i INSTANCE]\n"
-        "       rosafe setup -h"
-    )
     parser.add_argument("action", choices=("save", "load"), help="action")
     parser.add_argument("file", metavar="FILE.yaml", help="the setup; - means standard output or input")
     parser.add_argument("--full", action="store_true", help="save: also write parameters with default values")
@@ -50,13 +52,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="maximum time to wait for master and nodes that are starting (default: 0)",
     )
     add_instance(parser)
-    parser.epilog = (
-        "exit status: 0 success, 1 refused (nothing was changed), 2 wrong command line\n\n"
-        "examples:\n"
-        "  rosafe setup save tree.yaml\n"
-        "  rosafe setup load tree.yaml\n"
-        "  rosafe setup save - --full"
-    )
 
 
 def run(options: argparse.Namespace) -> int:

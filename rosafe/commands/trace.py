@@ -7,7 +7,11 @@ and the numbers of the blocks. ROSAFE_WORKERS sets the number of workers.
 
 Without SOUND the command subscribes to a node, which traces only during the subscription. A node that keeps up waits
 for sound most of the time, and a parent is idle while its children work. With SOUND, a file with two channels, the
-default tree computes at full speed without ROS. Ctrl-C ends the trace early."""
+default tree computes at full speed without ROS. Ctrl-C ends the trace early.
+
+examples:
+  rosafe trace --seconds 10 -o trace.json
+  rosafe trace speech.wav -o trace.json"""
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ import queue
 import re
 import sys
 import time
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,7 +62,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="frames per block of SOUND (default: %(default)s)",
     )
     parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
-    parser.epilog = "examples:\n  rosafe trace --seconds 10 -o trace.json\n  rosafe trace speech.wav -o trace.json"
 
 
 def run(options: argparse.Namespace) -> int:
@@ -99,8 +102,7 @@ def _compute(path: Path, seconds: float, block: int) -> list[Event]:
 
     tracer = Tracer()
     try:
-        sound = AudioFile(path)
-        try:
+        with closing(AudioFile(path)) as sound:
             if sound.channels != 2:
                 raise CommandError(f"{path}: expected two channels, left and right ear, got {sound.channels}")
             if sound.remark:
@@ -111,8 +113,6 @@ def _compute(path: Path, seconds: float, block: int) -> list[Event]:
             with Chain(blocks, sound.sample_rate, values, CORE_REPRESENTATIONS, lambda *_: None) as chain:
                 chain.observe(tracer)
                 chain.run()
-        finally:
-            sound.close()
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
     return tracer.take()

@@ -1,7 +1,15 @@
 """Start the complete front-end: a ROS master, bass, rosAFE, genomixd, a setup, the localizer, and the live page.
 
 Processes that already run are used and continue afterwards. Processes that were started here end with Ctrl-C. FILE.yaml
-is a setup with sound and processors; `rosafe setup save` writes one, and docs/setups.md describes it."""
+is a setup with sound and processors; `rosafe setup save` writes one, and docs/setups.md describes it.
+
+exit status: 0 ended by Ctrl-C, 1 a process did not start or ended by itself, 2 wrong command line
+
+examples:
+  rosafe up
+  rosafe up setups/scene.yaml --live     # the built-in scene and its representations
+  rosafe up tree.yaml
+  rosafe up --device plughw:1,0 --localize --head robot.head --live     # sources around a robot"""
 
 from __future__ import annotations
 
@@ -29,10 +37,6 @@ POLL_SECONDS = 1.0  # between two queries of the state of all nodes
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.usage = (
-        "rosafe up [FILE.yaml] [--device DEVICE] [--localize] [--head FILE] [--[no-]mirror] [--live] [--keep FILE]\n"
-        "                 [--port PORT] [--live-port PORT] [--no-browser]"
-    )
     parser.add_argument("file", metavar="FILE.yaml", nargs="?", help="the setup to load (default: none)")
     parser.add_argument("--device", metavar="DEVICE", help="capture from DEVICE, instead of the sound of FILE.yaml")
     parser.add_argument(
@@ -62,14 +66,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="port of the live page (default: 8090)",
     )
     parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
-    parser.epilog = (
-        "exit status: 0 ended by Ctrl-C, 1 a process did not start or ended by itself, 2 wrong command line\n\n"
-        "examples:\n"
-        "  rosafe up\n"
-        "  rosafe up setups/scene.yaml --live     # the built-in scene and its representations\n"
-        "  rosafe up tree.yaml\n"
-        "  rosafe up --device plughw:1,0 --localize --head robot.head --live     # sources around a robot"
-    )
 
 
 def run(options: argparse.Namespace) -> int:

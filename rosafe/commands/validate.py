@@ -2,7 +2,15 @@
 
 One line is printed for each comparison: the deviation, its tolerance and the source of the reference values; known
 limitations are reported without a tolerance. Toolboxes that are not installed are skipped. Nothing is installed, and no
-network is needed. docs/validation.md is the page that -o writes."""
+network is needed. docs/validation.md is the page that -o writes.
+
+exit status: 0 if all comparisons passed (with --self-test: if all disturbances were detected), 1 if not
+
+examples:
+  rosafe validate
+  rosafe validate --self-test
+  rosafe validate -o validation.md
+  rosafe validate --figures ."""
 
 from __future__ import annotations
 
@@ -39,14 +47,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--figures",
         metavar="FOLDER",
         help="only write published curves with those of rosAFE: figures.md and pictures; existing files are replaced",
-    )
-    parser.epilog = (
-        "exit status: 0 if all comparisons passed (with --self-test: if all disturbances were detected), 1 if not\n\n"
-        "examples:\n"
-        "  rosafe validate\n"
-        "  rosafe validate --self-test\n"
-        "  rosafe validate -o validation.md\n"
-        "  rosafe validate --figures ."
     )
 
 

@@ -41,7 +41,8 @@ class Parameter:
 
     `minimum` and `maximum` are inclusive, except for the minimum if `open_minimum` is set. They limit the elements of a
     sequence, `least` and `most` its length, `longest` the characters of a text. `choices` are the valid values of an
-    enumerated string, or of each element of a list of strings.
+    enumerated string, or of each element of a list of strings. `real`, `positive`, `count`, `text` and `flag` create
+    parameters of the usual types.
     Requests from the ROS graph may contain any word: `resolve_choice` replaces an unknown one by `fallback`, as the
     original does. Without a fallback, and in all other interfaces, an unknown word is an error.
     """
@@ -66,6 +67,35 @@ class Parameter:
     zero_is_default: bool = True  # in ROS requests, which carry no defaults
     follows_rate: bool = False  # if no value is given, the default may be replaced by one that suits the sample rate
     checked_by_client: bool = False  # for a number in the component, whose error could not name the choices
+
+    @classmethod
+    def real(
+        cls, name: str, default: Any, doc: str, minimum: float | None = None, maximum: float | None = None, **more: Any
+    ) -> Parameter:
+        """Return a real number, with `more` attributes by name."""
+        return cls(name, "double", default, doc, minimum, maximum, **more)
+
+    @classmethod
+    def positive(cls, name: str, default: Any, doc: str, maximum: float | None = None, **more: Any) -> Parameter:
+        """Return a real number above 0."""
+        return cls(name, "double", default, doc, 0.0, maximum, open_minimum=True, **more)
+
+    @classmethod
+    def count(
+        cls, name: str, default: Any, doc: str, minimum: int | None = None, maximum: int | None = None, **more: Any
+    ) -> Parameter:
+        """Return a whole number that is not negative."""
+        return cls(name, "unsigned long", default, doc, minimum, maximum, **more)
+
+    @classmethod
+    def text(cls, name: str, default: Any, doc: str, choices: tuple[str, ...] = (), **more: Any) -> Parameter:
+        """Return a string, if `choices` are given one of them."""
+        return cls(name, "string", default, doc, choices=choices, **more)
+
+    @classmethod
+    def flag(cls, name: str, default: Any, doc: str, **more: Any) -> Parameter:
+        """Return a boolean."""
+        return cls(name, "boolean", default, doc, **more)
 
     def __post_init__(self) -> None:
         for problem in itertools.chain(_declaration_problems(self), self._default_problems()):

@@ -31,9 +31,9 @@ def frame_parameters(
 ) -> tuple[Parameter, Parameter, Parameter]:
     """Return the three parameters of every framed stage: window, its duration, and the step between frames."""
     return (
-        Parameter(f"{prefix}_wname", "string", "hann", "Window name", choices=windows, fallback=fallback),
-        Parameter(f"{prefix}_wSizeSec", "double", 0.02, "Window duration (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"),
-        Parameter(f"{prefix}_hSizeSec", "double", 0.01, "Window step size (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"),
+        Parameter.text(f"{prefix}_wname", "hann", "Window name", windows, fallback=fallback),
+        Parameter.positive(f"{prefix}_wSizeSec", 0.02, "Window duration (s)", MAX_FRAME_SECONDS, unit="s"),
+        Parameter.positive(f"{prefix}_hSizeSec", 0.01, "Window step size (s)", MAX_FRAME_SECONDS, unit="s"),
     )
 
 

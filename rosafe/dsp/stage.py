@@ -18,9 +18,7 @@ from .copies import OwnState
 from .numeric_limits import FloatArray
 from .signal_format import SignalFormat
 
-SAMPLE_RATE = Parameter(
-    "sample_rate", "double", REQUIRED, "Samples per second (Hz)", 0.0, 1e9, open_minimum=True, unit="Hz"
-)
+SAMPLE_RATE = Parameter.positive("sample_rate", REQUIRED, "Samples per second (Hz)", 1e9, unit="Hz")
 FLOAT64 = np.dtype(np.float64)
 Output = FloatArray | tuple[FloatArray, ...]  # a tuple if the representation has several parts
 

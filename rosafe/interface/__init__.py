@@ -2,7 +2,8 @@
 
 The nodes, the HTTP server, the Tcl help, the documentation and the files in msg/, srv/ and action/ are derived from
 this table. It is derived from the declarations of the representations (rosafe/representations), the only place that
-defines the name, type, default, range and order of a parameter.
+defines the name, type, default, range and order of a parameter. Structures that do not depend on representations are in
+the IDL files of this folder.
 """
 
 from __future__ import annotations

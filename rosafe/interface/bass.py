@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-from rosafe.declarations.idl import TIME
 from rosafe.declarations.parameter import Parameter
 
 from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT
-from .service import ComponentSpec, PortSpec, Service, Struct
+from .service import ComponentSpec, PortSpec, Service, read_idl
 
-BINAUDIO: dict[str, Struct] = {
-    "::binaudio::timestamp": (("sec", "unsigned long"), ("nsec", "unsigned long")),
-    "::binaudio::portStruct": (
-        ("sampleRate", "unsigned long"),
-        ("nChunksOnPort", "unsigned long"),
-        ("nFramesPerChunk", "unsigned long"),
-        ("lastFrameIndex", "unsigned long long"),
-        ("left", "sequence<long>"),
-        ("right", "sequence<long>"),
-        ("stamp", "::binaudio::timestamp"),
-    ),
-}
+_IDL = read_idl(__file__)
+BINAUDIO = _IDL["struct"]
 
 BASS = ComponentSpec(
     name="bass",
@@ -29,23 +18,21 @@ BASS = ComponentSpec(
             "Acquire",
             "Capture from a device and publish on Audio until stopped",
             (
-                Parameter(
+                Parameter.text(
                     "device",
-                    "string",
                     "hw:1,0",
                     "ALSA name of the sound device, file:PATH, bag:PATH, topic:/NAME, scene: or scene:FILE.yaml",
                 ),
-                Parameter(
+                Parameter.count(
                     "sampleRate",
-                    "unsigned long",
                     44100,
                     "Sample rate (Hz); 0: that of the source with file: and bag:, otherwise 44100",
                     0,
                     768000,
                     zero_is_default=False,
                 ),
-                Parameter("nFramesPerChunk", "unsigned long", 2205, "Frames in one chunk", 1, 1_000_000),
-                Parameter("nChunksOnPort", "unsigned long", 20, "Chunks in the window on the port", 1, 100_000),
+                Parameter.count("nFramesPerChunk", 2205, "Frames in one chunk", 1, 1_000_000),
+                Parameter.count("nChunksOnPort", 20, "Chunks in the window on the port", 1, 100_000),
             ),
             throws=("::bass::e_nomem", "::bass::e_device", "::bass::e_hwparams", "::bass::e_swparams"),
             activity=True,
@@ -98,13 +85,5 @@ BASS = ComponentSpec(
         "e_swparams": "the device's software parameters cannot be set",
     },
     structs={**BINAUDIO, **GENOM_STATE},
-    messages={
-        "SceneTruth": (
-            ("stamp", TIME),
-            ("frameIndex", "unsigned long long"),
-            ("head_yaw", "double"),
-            ("names", "sequence<string>"),
-            ("azimuths", "sequence<double>"),
-        ),
-    },
+    messages=_IDL["message"],
 )

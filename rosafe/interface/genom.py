@@ -4,33 +4,16 @@ from __future__ import annotations
 
 from rosafe.declarations.parameter import REQUIRED, Parameter
 
-from .service import PortSpec, Service, Struct
+from .service import PortSpec, Service, read_idl
 
-GENOM_EXCEPTIONS: dict[str, Struct] = {
-    "incompatible_digest": (("client", "::genom::version"), ("server", "::genom::version")),
-    "bad_transition": (("from", "string"), ("to", "string")),
-    "interrupted": (("by", "string"),),
-    "serialization": (),
-    "too_many_activities": (),
-    "disallowed": (),
-    "no_such_inport": (),
-    "no_such_outport": (),
-    "port_io": (),
-    "no_such_remote": (),
-    "no_such_service": (),
-    "remote_io": (),
-    "no_such_activity": (),
-    "fatal": (),
-    "mwerr": (("what", "string"),),
-    "unkex": (("what", "string"),),
-    "syserr": (("code", "long"),),
-}
+_IDL = read_idl(__file__)
+GENOM_EXCEPTIONS, GENOM_STATE = _IDL["exception"], _IDL["struct"]
 
 MAX_ACTIVITIES = 256  # per task, including its permanent one; deviation: the original has at most 32
 
 _PORT_NAMES = (
-    Parameter("local", "string", REQUIRED, "Name of this component's input port"),
-    Parameter("remote", "string", REQUIRED, "Name of the topic to read, such as bass/Audio"),
+    Parameter.text("local", REQUIRED, "Name of this component's input port"),
+    Parameter.text("remote", REQUIRED, "Name of the topic to read, such as bass/Audio"),
 )
 COMMON_SERVICES = (
     Service(
@@ -43,38 +26,18 @@ COMMON_SERVICES = (
         "connect_service",
         "Connect a remote service",
         (
-            Parameter("local", "string", REQUIRED, "Name of this component's remote"),
-            Parameter("remote", "string", REQUIRED, "Name of the service to use"),
+            Parameter.text("local", REQUIRED, "Name of this component's remote"),
+            Parameter.text("remote", REQUIRED, "Name of the service to use"),
         ),
         throws=("::genom::no_such_remote", "::genom::no_such_service", "::genom::remote_io"),
     ),
     Service(
         "abort_activity",
         "End one activity",
-        (Parameter("activity", "unsigned long", REQUIRED, "Number of the activity, as genom_state shows it"),),
+        (Parameter.count("activity", REQUIRED, "Number of the activity, as genom_state shows it"),),
         throws=("::genom::no_such_activity",),
     ),
     Service("kill", "End all activities and the component"),
 )
 
-GENOM_STATE: dict[str, Struct] = {
-    "::genom_state::stats": (("last", "float"), ("max", "float"), ("avg", "float")),
-    "::genom_state::rusage": (
-        ("cycles", "unsigned long"),
-        ("timings", "::genom_state::stats"),
-        ("load", "::genom_state::stats"),
-    ),
-    "::genom_state::activity": (("id", "unsigned long"), ("name", "string")),
-    "::genom_state::task": (
-        ("name", "string"),
-        ("rusage", "::genom_state::rusage"),
-        ("activity", "sequence<::genom_state::activity>"),
-    ),
-    "::genom_state::component": (
-        ("task", "sequence<::genom_state::task>"),
-        ("digest", "string"),
-        ("date", "string"),
-        ("version", "string"),
-    ),
-}
 GENOM_STATE_PORT = PortSpec("genom_state", "::genom_state::component", "Tasks and live activities of the component")

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from rosafe.declarations.block_length import DEFAULT_FRAMES_PER_BLOCK, MAX_FRAMES_PER_BLOCK
-from rosafe.declarations.idl import TIME
 from rosafe.declarations.parameter import REQUIRED, Parameter
 from rosafe.declarations.representation import Representation
 from rosafe.declarations.signals import SIGNALS, layout
@@ -15,13 +14,14 @@ from rosafe.representations.registry import CORE_KINDS
 
 from .bass import BINAUDIO
 from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT
-from .service import ComponentSpec, PortSpec, Service, Struct
+from .service import ComponentSpec, PortSpec, Service, Struct, read_idl
 
 MAX_SECONDS = 600.0  # of a port or history
 MAX_SETUP = 4 * 2**20  # characters of a setup; over HTTP, the URL length is the lower limit
 RESTORED_PARAM = "restored"  # private ROS parameter: address of the node and the processors that it restores (`--keep`)
 MAX_PARAMETERS = 2**18  # characters of the parameters of a request for a whole tree, as a ROS service
 
+_IDL = read_idl(__file__)
 Kinds = Mapping[str, Representation]  # parents first
 
 LAYOUTS = {kind: layout(representation) for kind, representation in KINDS.items()}
@@ -52,55 +52,19 @@ def _structs(kinds: Kinds) -> dict[str, Struct]:
         (kind, f"sequence<{parameter_struct(kind)}>") for kind in CORE_REPRESENTATIONS
     )
     structs["::rosAFE::dataObjSt"] = tuple((kind, f"sequence<{LAYOUTS[kind].idl}>") for kind in CORE_REPRESENTATIONS)
-    structs["::rosAFE::frameTime"] = (("stamp", TIME), ("frameIndex", "unsigned long long"), ("sampleRate", "double"))
-    structs["::rosAFE::parameterValue"] = (("name", "string"), ("value", "string"))
-    structs["::rosAFE::processor"] = (
-        *((name, "string") for name in ("name", "kind", "request", "upperDepName", "port", "topic")),
-        ("rate", "double"),
-        ("shape", "sequence<unsigned long>"),
-        ("axes", "sequence<string>"),
-        ("parameters", "sequence<::rosAFE::parameterValue>"),
-    )
-    structs["::rosAFE::representation"] = (
-        ("name", "string"),
-        ("rate", "double"),
-        ("lastFrameIndex", "unsigned long long"),
-        ("axes", "sequence<string>"),
-        ("shape", "sequence<unsigned long>"),
-        ("data", "sequence<double>"),
-    )
-    return structs
+    return {**structs, **_IDL["struct"]}
 
 
 # --- requests ---------------------------------------------------------------------------------------------------
 
 BLOCK_AND_BUFFERS = (
-    Parameter(
-        "nFramesPerBlock",
-        "unsigned long",
-        DEFAULT_FRAMES_PER_BLOCK,
-        "Frames in one block",
-        1,
-        MAX_FRAMES_PER_BLOCK,
-    ),
-    Parameter(
-        "bufferSize_s_port",
-        "double",
-        1.0,
-        "Seconds of signal on every output port",
-        0.0,
-        MAX_SECONDS,
-        open_minimum=True,
-        unit="s",
-    ),
-    Parameter(
+    Parameter.count("nFramesPerBlock", DEFAULT_FRAMES_PER_BLOCK, "Frames in one block", 1, MAX_FRAMES_PER_BLOCK),
+    Parameter.positive("bufferSize_s_port", 1.0, "Seconds of signal on every output port", MAX_SECONDS, unit="s"),
+    Parameter.positive(
         "bufferSize_s_getSignal",
-        "double",
         1.0,
         "Seconds of signal that getSignals can return; at least two blocks",
-        0.0,
         MAX_SECONDS,
-        open_minimum=True,
         unit="s",
     ),
 )
@@ -115,7 +79,7 @@ _PROCESSOR_THROWS = (
 
 def _creation_service(representation: Representation, kinds: Kinds) -> Service:
     """Return the request that adds a processor."""
-    name = Parameter("name", "string", representation.name, representation.name_doc)
+    name = Parameter.text("name", representation.name, representation.name_doc)
     parent = representation.parent
     if not parent:
         return Service(
@@ -127,7 +91,7 @@ def _creation_service(representation: Representation, kinds: Kinds) -> Service:
             task=representation.kind,
             interrupts=(representation.request,),
         )
-    upper = Parameter("upperDepName", "string", kinds[parent].name, "The name of the upper dependency")
+    upper = Parameter.text("upperDepName", kinds[parent].name, "The name of the upper dependency")
     return Service(
         representation.request,
         representation.doc,
@@ -145,14 +109,13 @@ def _whole_trees(kinds: Kinds) -> tuple[Service, ...]:
         "request",
         "Build a representation with all processors that it needs; existing processors are used",
         (
-            Parameter(
+            Parameter.text(
                 "representation",
-                "string",
                 REQUIRED,
                 "The representation, such as ild",
-                choices=tuple(kind.word for kind in kinds.values()),
+                tuple(kind.word for kind in kinds.values()),
             ),
-            Parameter("connect", "string", "bass/Audio", "Topic for the Audio port, if a new input needs one"),
+            Parameter.text("connect", "bass/Audio", "Topic for the Audio port, if a new input needs one"),
             *BLOCK_AND_BUFFERS,
             *{p.name: p for kind in kinds.values() for p in kind.parameters}.values(),  # two kinds share some
         ),
@@ -176,14 +139,14 @@ def _whole_trees(kinds: Kinds) -> tuple[Service, ...]:
     save = Service(
         "saveSetup",
         "The tree of processors and its sound, as the text of a setup file for loadSetup; without the localizer",
-        (Parameter("full", "boolean", False, "Flag to include parameters that have their default values"),),
+        (Parameter.flag("full", False, "Flag to include parameters that have their default values"),),
         outputs=(("setup", "string"),),
     )
     load = Service(
         "loadSetup",
         "Build the tree that a setup describes, in addition to existing processors: completely, or without any change. "
         "The section localizer is for `rosafe up` and `rosafe setup load`",
-        (Parameter("setup", "string", REQUIRED, "The text of a setup (YAML)", longest=MAX_SETUP),),
+        (Parameter.text("setup", REQUIRED, "The text of a setup (YAML)", longest=MAX_SETUP),),
         outputs=(("created", "sequence<string>"), ("reused", "sequence<string>"), ("sound", "string")),
         throws=_INPUT_THROWS,
     )
@@ -194,17 +157,15 @@ def _ros_services(composites: tuple[Service, ...]) -> tuple[Service, ...]:
     """Return the requests for whole trees as ROS services."""
     build, find, save, load = composites
     parameters = (
-        Parameter("representation", "string", REQUIRED, "The representation, such as ild: see request.md"),
-        Parameter(
+        Parameter.text("representation", REQUIRED, "The representation, such as ild: see request.md"),
+        Parameter.text(
             "parameters",
-            "string",
             "",
             "Parameters of it and of its ancestors, as YAML: 'fb_nChannels: 16, pi_rangeHz: [80, 300]'",
             longest=MAX_PARAMETERS,
         ),
-        Parameter(
+        Parameter.text(
             "connect",
-            "string",
             "",
             "Topic for the Audio port, if a new input needs one; empty: bass/Audio, unless the port is connected",
         ),
@@ -219,9 +180,8 @@ def _ros_services(composites: tuple[Service, ...]) -> tuple[Service, ...]:
             "The section sound is for clients, which call bass",
             parameters=(
                 *load.parameters,
-                Parameter(
+                Parameter.flag(
                     "check",
-                    "boolean",
                     False,
                     "Flag to change nothing, and to return the names of the processors that it would create",
                 ),
@@ -248,7 +208,7 @@ _FUNCTIONS = (
     Service(
         "getDependencies",
         "The names of the processors from the input down to the named one",
-        (Parameter("nameProc", "string", "nameProc", "The name of the processor"),),
+        (Parameter.text("nameProc", "nameProc", "The name of the processor"),),
         outputs=(("dependencies", "sequence<string>"),),
         throws=("::rosAFE::e_noMemory", "::rosAFE::e_noSuchProcessor"),
     ),
@@ -267,7 +227,7 @@ _FUNCTIONS = (
     Service(
         "getRepresentation",
         "The output of one processor of any kind since the last call for this processor",
-        (Parameter("name", "string", "name", "The name of the processor"),),
+        (Parameter.text("name", "name", "The name of the processor"),),
         outputs=(("parts", "sequence<::rosAFE::representation>"),),
         throws=("::rosAFE::e_noMemory", "::rosAFE::e_noSuchProcessor"),
     ),
@@ -275,9 +235,9 @@ _FUNCTIONS = (
         "modifyParameter",
         "Change one parameter of a processor from its next block on",
         (
-            Parameter("nameProc", "string", "nameProc", "The name of the processor to change the parameter"),
-            Parameter("nameParam", "string", "nameParam", "The name of the parameter to be changed"),
-            Parameter("newValue", "string", "newValue", "The new value of the parameter to be changed"),
+            Parameter.text("nameProc", "nameProc", "The name of the processor to change the parameter"),
+            Parameter.text("nameParam", "nameParam", "The name of the parameter to be changed"),
+            Parameter.text("newValue", "newValue", "The new value of the parameter to be changed"),
         ),
         throws=(
             "::rosAFE::e_noMemory",
@@ -289,38 +249,10 @@ _FUNCTIONS = (
     Service(
         "removeProcessor",
         "Remove a processor and all that depend on it; the input cannot be removed",
-        (Parameter("name", "string", "name", "The name of the processor to delete", aliases=("nameProc",)),),
+        (Parameter.text("name", "name", "The name of the processor to delete", aliases=("nameProc",)),),
         throws=("::rosAFE::e_noSuchProcessor",),
     ),
 )
-
-# Messages of the localizer, in ROS types: their topics are not ports. Angles are in rad, left positive (REP 103).
-_LOCALIZER_MESSAGES: dict[str, Struct] = {
-    "SoundSource": (
-        ("id", "unsigned long"),
-        ("azimuth", "double"),
-        ("azimuth_std", "double"),
-        ("probability", "double"),
-        ("level", "double"),
-        ("first_seen", TIME),
-        ("last_seen", TIME),
-        ("speech", "double"),
-    ),
-    "SoundSources": (("header", "::Header"), ("sources", "sequence<::SoundSource>")),
-    "SourceAudio": (
-        ("header", "::Header"),
-        ("id", "unsigned long"),
-        ("azimuth", "double"),
-        ("sample_rate", "unsigned long"),
-        ("first_sample", "unsigned long long"),
-        ("samples", "sequence<short>"),
-    ),
-    "DirectionPosterior": (
-        ("header", "::Header"),
-        ("azimuths", "sequence<double>"),
-        ("probability", "sequence<double>"),
-    ),
-}
 
 # --- the component ----------------------------------------------------------------------------------------------
 
@@ -367,7 +299,7 @@ def derive(kinds: Kinds) -> ComponentSpec:
             "e_badNewValue": "a value of the wrong type or out of its range",
         },
         structs={**_structs(kinds), **BINAUDIO, **GENOM_STATE},
-        messages=_LOCALIZER_MESSAGES,
+        messages=_IDL["message"],
         client_side_services=composites,
         ros_services=_ros_services(composites),
     )

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 from rosafe.declarations.errors import ComponentError
@@ -13,6 +15,17 @@ from rosafe.declarations.parameter import REQUIRED, Parameter
 from rosafe.declarations.signals import Struct
 
 _N = TypeVar("_N", Parameter, "PortSpec", "Service")
+
+_DECLARATION = re.compile(r"^(struct|exception|message) (\S+) \{(.*?)\};$", re.MULTILINE | re.DOTALL)
+_FIELD = re.compile(r"\s*([^;]+) (\w+);")
+
+
+def read_idl(module: str) -> dict[str, dict[str, Struct]]:
+    """Return the contents of the IDL file beside a module: structs, exceptions and messages, each by name."""
+    found: dict[str, dict[str, Struct]] = {"struct": {}, "exception": {}, "message": {}}
+    for kind, name, body in _DECLARATION.findall(Path(module).with_suffix(".idl").read_text("utf-8")):
+        found[kind][name] = tuple((field, idl) for idl, field in _FIELD.findall(body))
+    return found
 
 
 def _find(items: Iterable[_N], name: str) -> _N:

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -192,48 +193,45 @@ def _source_modified(source: str | Path, target: str | Path) -> bool:
     return os.path.exists(source) and os.stat(target).st_mtime_ns < os.stat(source).st_mtime_ns <= time.time_ns()
 
 
+@dataclass
 class _FileRun:
     """The computation of one file."""
 
-    def __init__(
-        self,
-        sound: SoundReader,
-        path: Path,
-        file_format: Format,
-        about: Mapping[str, Any],
-        values: Mapping[str, Any],
-        kinds: list[str],
-        progress: Callable[[int, int], None],
-    ) -> None:
-        self._sound, self._path, self._format, self._kinds, self._values = sound, path, file_format, kinds, values
-        self._about = about
-        self._progress = progress
+    sound: SoundReader
+    path: Path
+    file_format: Format
+    about: Mapping[str, Any]
+    values: Mapping[str, Any]
+    kinds: list[str]
+    progress: Callable[[int, int], None]
+
+    def __post_init__(self) -> None:
         self._padding = 0
-        self._limiter = FrameLimiter(sound.frames)
-        self._done = dict.fromkeys(kinds, 0)
+        self._limiter = FrameLimiter(self.sound.frames)
+        self._done = dict.fromkeys(self.kinds, 0)
         self._lock = threading.Lock()
         self._writer: ResultWriter
 
     def run(self) -> tuple[str, ...]:
         """Compute and write everything. Return the names of outputs without frames."""
-        sound, kinds = self._sound, self._kinds
+        sound, kinds = self.sound, self.kinds
         ears = computed_ears(sound.channels, kinds)
-        with Chain(self._blocks(ears), sound.sample_rate, self._values, kinds, self._write, ears=ears) as chain:
-            kind, taken = chain.largest_block(min(self._about["block_frames"], sound.frames))
+        with Chain(self._blocks(ears), sound.sample_rate, self.values, kinds, self._write, ears=ears) as chain:
+            kind, taken = chain.largest_block(min(self.about["block_frames"], sound.frames))
             advice = "take fewer channels or lags, or a smaller --block"
             sizes.check_memory(kind, sizes.MAX_BYTES, taken, advice, content="one block")  # several exist at a time
-            self._padding = chain.padding(sound.frames) if "pad" in self._about else 0
+            self._padding = chain.padding(sound.frames) if "pad" in self.about else 0
             contents = self._contents(chain)
-            writer_class = self._format.writer(contents)
-            _check_disk_space(self._path, writer_class.size(contents))
-            with closing(writer_class(self._path, contents)) as self._writer:
+            writer_class = self.file_format.writer(contents)
+            _check_disk_space(self.path, writer_class.size(contents))
+            with closing(writer_class(self.path, contents)) as self._writer:
                 chain.run(merge=True)
                 contents.about["clipped"] = sound.clipped
                 self._writer.finish()
         return tuple(name for name, shape in contents.shapes.items() if not shape[-1])
 
     def _blocks(self, ears: int) -> Iterator[np.ndarray]:
-        sound, length = self._sound, self._about["block_frames"]
+        sound, length = self.sound, self.about["block_frames"]
         for first in range(0, sound.frames, length):
             count = min(length, sound.frames - first)
             block = sound.read(count)
@@ -248,13 +246,13 @@ class _FileRun:
     def _write(self, kind: str, branch: int, block: Block) -> None:
         kept = self._limiter.kept(kind, branch, block)
         for (name, part), data in zip(KINDS[kind].outputs.items(), block.parts, strict=True):
-            self._writer.append(name, of_ears(self._sound.channels, part.axes, data)[..., :kept])
+            self._writer.append(name, of_ears(self.sound.channels, part.axes, data)[..., :kept])
         with self._lock:
-            self._done[kind] = min(block.next_index, self._sound.frames)
-            self._progress(min(self._done.values()), self._sound.frames)
+            self._done[kind] = min(block.next_index, self.sound.frames)
+            self.progress(min(self._done.values()), self.sound.frames)
 
     def _contents(self, chain: Chain) -> Contents:
-        frames, kinds, pad = self._sound.frames, self._kinds, "pad" in self._about
+        frames, kinds, pad = self.sound.frames, self.kinds, "pad" in self.about
         parts = {name: part for kind in kinds for name, part in KINDS[kind].outputs.items()}
         described = chain.describe()
         names = {name: value for name, value in described.items() if isinstance(value, list)}
@@ -263,16 +261,16 @@ class _FileRun:
         shapes = {}
         for kind in kinds:
             for name, (shape,) in chain.shapes(kind, frames, pad).items():
-                ears = (self._sound.channels,) if parts[name].axes[0] == "ear" else shape[:1]
+                ears = (self.sound.channels,) if parts[name].axes[0] == "ear" else shape[:1]
                 shapes[name] = (*ears, *shape[1:]) if len(shape) > 1 else shape
-        rate = self._sound.sample_rate
-        parameters = effective_parameters(self._values, kinds, rate)
+        rate = self.sound.sample_rate
+        parameters = effective_parameters(self.values, kinds, rate)
         return Contents(
             shapes,
             {name: part.axes for name, part in parts.items()},
             {name: part.unit for name, part in parts.items()},
             {**{name: value for name, value in described.items() if name not in names}, **times},
-            {**self._about, "sample_rate": rate, "parameters": parameters, **names, "clipped": 0},
+            {**self.about, "sample_rate": rate, "parameters": parameters, **names, "clipped": 0},
         )
 
 

@@ -272,7 +272,22 @@ class Stream(OwnState):
             by name; and the other entries that `rosafe.process` returns: `<kind>_frameRate` (Hz), `fb_cfHz` (Hz),
             `cc_lags` (s) and similar ones.
         """
-        return _describe(self._rate, self._stages, list(self._next))
+        parameters: dict[str, Any] = {}
+        described: dict[str, Any] = {}
+        for kind, stage in self._stages.items():
+            known = {**stage.parameters, **stage.derived}
+            parameters.update(stage.request_values(stage.parameters))
+            described.update({name: axis_values(known[name]) for name in KINDS[kind].coordinates})
+            if stage.output_format.framed and kind in self._next:
+                described[f"{kind}_frameRate"] = stage.output_format.rate
+        parts = {name: part for kind in self._next for name, part in KINDS[kind].outputs.items()}
+        return {
+            "sample_rate": self._rate,
+            "parameters": parameters,
+            "axes": {name: part.axes for name, part in parts.items()},
+            "units": {name: part.unit for name, part in parts.items()},
+            **described,
+        }
 
 
 def create_stages(
@@ -305,23 +320,3 @@ def _connect(stages: Mapping[str, Stage]) -> dict[str, tuple[int, ...]]:
         children = (child for name, child in stages.items() if KINDS[name].parent == kind)
         stage.provide = frozenset(child.required_extra for child in children) - {""}
     return rows
-
-
-def _describe(rate: float, stages: Mapping[str, Stage], outputs: Sequence[str]) -> dict[str, Any]:
-    """Return the entries of `Stream.describe`."""
-    parameters: dict[str, Any] = {}
-    described: dict[str, Any] = {}
-    for kind, stage in stages.items():
-        known = {**stage.parameters, **stage.derived}
-        parameters.update(stage.request_values(stage.parameters))
-        described.update({name: axis_values(known[name]) for name in KINDS[kind].coordinates})
-        if stage.output_format.framed and kind in outputs:
-            described[f"{kind}_frameRate"] = stage.output_format.rate
-    parts = {name: part for kind in outputs for name, part in KINDS[kind].outputs.items()}
-    return {
-        "sample_rate": rate,
-        "parameters": parameters,
-        "axes": {name: part.axes for name, part in parts.items()},
-        "units": {name: part.unit for name, part in parts.items()},
-        **described,
-    }

@@ -60,15 +60,14 @@ class Adaptation(Stage):
         axes=("ear", "channel", "time"),
         unit="MU",
         parameters=(
-            Parameter(
+            Parameter.real(
                 "adpt_lim",
-                "double",
                 10.0,
                 "Limit of the overshoot, as ratio of the onset's response to the steady one; 1 or less: none",
                 0.0,
                 1e6,
             ),
-            Parameter("adpt_mindB", "double", 0.0, "Quietest audible level (dB SPL)", -300.0, 99.0, unit="dB"),
+            Parameter.real("adpt_mindB", 0.0, "Quietest audible level (dB SPL)", -300.0, 99.0, unit="dB"),
             Parameter(
                 "adpt_tau",
                 "sequence<double>",
@@ -81,12 +80,11 @@ class Adaptation(Stage):
                 most=kernels.MAX_LOOPS,
                 unit="s",
             ),
-            Parameter(
+            Parameter.text(
                 "adpt_model",
-                "string",
                 "",
                 "Published set that overrides the other three; empty: none",
-                choices=(*SETS, ""),
+                (*SETS, ""),
                 spellings={"adt_breebart": "adt_breebaart"},
             ),
         ),

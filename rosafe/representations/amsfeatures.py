@@ -74,40 +74,34 @@ class AmsFeatures(FramedStage):
         axes=("ear", "channel", "filter", "time"),
         level=20.0,
         parameters=(
-            Parameter(
+            Parameter.text(
                 "ams_fbType",
-                "string",
                 "log",
                 "Modulation filters of constant Q (log), or bins of an FFT summed up by triangles (lin)",
-                choices=("log", "lin"),
+                ("log", "lin"),
             ),
-            Parameter(
+            Parameter.count(
                 "ams_nFilters",
-                "unsigned long",
                 15,
                 "Number of modulation filters; 0 (log only): one an octave",
                 0,
                 MAX_FILTERS,
                 aliases=("ams_nFilter",),
             ),
-            Parameter(
+            Parameter.real(
                 "ams_lowFreqHz",
-                "double",
                 4.0,
                 "Lowest centre frequency (Hz); lin: lower edge of the lowest triangle, which may be 0",
                 0.0,
                 1e6,
                 unit="Hz",
             ),
-            Parameter(
+            Parameter.positive(
                 "ams_highFreqHz",
-                "double",
                 1024.0,
                 "Highest centre frequency (Hz); lin: upper edge of the highest triangle; not given: lower if the "
                 "sample rate after ams_dsRatio requires it",
-                0.0,
                 1e6,
-                open_minimum=True,
                 unit="Hz",
                 follows_rate=True,
             ),
@@ -121,10 +115,10 @@ class AmsFeatures(FramedStage):
                 open_minimum=True,
                 unit="Hz",
             ),
-            Parameter("ams_dsRatio", "unsigned long", 4, "Decimation: one of this number of samples is used", 1, 1000),
-            Parameter("ams_wSizeSec", "double", 0.032, "Window duration (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"),
-            Parameter("ams_hSizeSec", "double", 0.016, "Window step size (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"),
-            Parameter("ams_wname", "string", "rectwin", "Window name", choices=ALL_NAMES),
+            Parameter.count("ams_dsRatio", 4, "Decimation: one of this number of samples is used", 1, 1000),
+            Parameter.positive("ams_wSizeSec", 0.032, "Window duration (s)", MAX_FRAME_SECONDS, unit="s"),
+            Parameter.positive("ams_hSizeSec", 0.016, "Window step size (s)", MAX_FRAME_SECONDS, unit="s"),
+            Parameter.text("ams_wname", "rectwin", "Window name", ALL_NAMES),
         ),
         coordinates=("ams_cfHz",),
         request="ModulationProc",

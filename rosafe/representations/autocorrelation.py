@@ -47,30 +47,20 @@ class Autocorrelation(FramedStage):
         axes=("ear", "channel", "lag", "time"),
         parameters=(
             *frame_parameters("ac", ALL_NAMES, fallback=""),
-            Parameter(
+            Parameter.text(
                 "ac_clipMethod",
-                "string",
                 "clp",
                 "Centre clipping: clp keeps samples beyond the threshold, clc subtracts it, sgn keeps their sign",
-                choices=kernels.CLIPPINGS,
+                kernels.CLIPPINGS,
             ),
-            Parameter(
+            Parameter.real(
                 "ac_clipAlpha",
-                "double",
                 0.6,
                 "Threshold of the clipping, as part of the frame's largest and smallest value",
                 0.0,
                 1.0,
             ),
-            Parameter(
-                "ac_K",
-                "double",
-                2.0,
-                "Exponent of the magnitude spectrum; 2: ordinary autocorrelation",
-                0.0,
-                10.0,
-                open_minimum=True,
-            ),
+            Parameter.positive("ac_K", 2.0, "Exponent of the magnitude spectrum; 2: ordinary autocorrelation", 10.0),
         ),
         derived=(Derived("ac_lags", "sequence<double>", "The lags, ascending from 0", unit="s"),),
         coordinates=("ac_lags",),

@@ -35,15 +35,8 @@ class CrossCorrelation(FramedStage):
         axes=("channel", "lag", "time"),
         parameters=(
             *frame_parameters("cc"),
-            Parameter(
-                "cc_maxDelaySec",
-                "double",
-                0.0011,
-                "Maximum delay in cross-correlation computation (s)",
-                0.0,
-                10.0,
-                open_minimum=True,
-                unit="s",
+            Parameter.positive(
+                "cc_maxDelaySec", 0.0011, "Maximum delay in cross-correlation computation (s)", 10.0, unit="s"
             ),
         ),
         request_order=("cc_wSizeSec", "cc_hSizeSec", "cc_maxDelaySec", "cc_wname"),

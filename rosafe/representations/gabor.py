@@ -77,14 +77,11 @@ class Gabor(Stage):
         parent="ratemap",
         axes=("ear", "feature", "time"),
         parameters=(
-            Parameter(
+            Parameter.positive(
                 "gb_maxDynamicRangeDB",
-                "double",
                 80.0,
                 "Dynamic range (dB): levels below the maximum minus this value are raised to it",
-                0.0,
                 1000.0,
-                open_minimum=True,
                 unit="dB",
             ),
         ),

@@ -72,7 +72,7 @@ class InnerHairCell(Stage):
         parent="gammatone",
         axes=("ear", "channel", "time"),
         level=20.0,
-        parameters=(Parameter("ihc_method", "string", "dau", "The IHC method name", choices=METHODS, fallback="dau"),),
+        parameters=(Parameter.text("ihc_method", "dau", "The IHC method name", METHODS, fallback="dau"),),
         name_doc="The name of this activity",
         port_doc="Output of each inner hair cell processor",
         word="innerhaircell",

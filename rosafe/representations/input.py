@@ -25,7 +25,7 @@ class Input(Stage):
         doc="Read the audio that comes in on the Audio port, block by block",
         axes=("ear", "time"),
         parameters=(
-            Parameter("in_doNormalize", "boolean", True, "Flag to divide the samples by in_normalizeValue"),
+            Parameter.flag("in_doNormalize", True, "Flag to divide the samples by in_normalizeValue"),
             Parameter(
                 "in_normalizeValue", "unsigned long long", 2**31 - 1, "Sample value that becomes 1.0", 1, 2**64 - 1
             ),

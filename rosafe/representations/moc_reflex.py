@@ -20,7 +20,7 @@ SILENCE = 1e-200  # any value with a level far below RISE
 def _factor(name: str, side: str) -> Parameter:
     doc = f"External factor on the nonlinear path of the {side} side; only 1, as nothing is fed back"
     alias = name.replace("moc_ext", "moc_moc")
-    return Parameter(name, "double", 1.0, doc, 0.0, 1.0, aliases=(alias,))
+    return Parameter.real(name, 1.0, doc, 0.0, 1.0, aliases=(alias,))
 
 
 class Moc(Stage):
@@ -43,9 +43,8 @@ class Moc(Stage):
         parameters=(
             _factor("moc_extIpsi", "same"),
             _factor("moc_extContra", "other"),
-            Parameter(
+            Parameter.real(
                 "moc_thresholdRatedB",
-                "double",
                 -180.0,
                 "Ratemap level below which the attenuation is constant (dB)",
                 -1000.0,
@@ -53,9 +52,8 @@ class Moc(Stage):
                 aliases=("moc_mocThresholdRatedB",),
                 unit="dB",
             ),
-            Parameter(
+            Parameter.real(
                 "moc_maxAttenuationdB",
-                "double",
                 40.0,
                 "Greatest attenuation (dB)",
                 0.0,

@@ -25,20 +25,18 @@ MIN_HISTORY_FRAMES = 512
 TOUCHING = np.ones((3, 3))  # neighbours of a unit in time and channel, including diagonal ones
 
 PARAMETERS = (
-    Parameter("trm_minStrengthdB", "double", 3.0, "Weaker transients are ignored (dB)", 0.0, 1000.0, unit="dB"),
-    Parameter("trm_minSpread", "unsigned long", 5, "Minimum number of connected units", 1, 1024),
-    Parameter(
+    Parameter.real("trm_minStrengthdB", 3.0, "Weaker transients are ignored (dB)", 0.0, 1000.0, unit="dB"),
+    Parameter.count("trm_minSpread", 5, "Minimum number of connected units", 1, 1024),
+    Parameter.real(
         "trm_fuseWithinSec",
-        "double",
         0.03,
         "Among transients of a channel closer than this, only the strongest is kept (s)",
         0.0,
         10.0,
         unit="s",
     ),
-    Parameter(
+    Parameter.real(
         "trm_minValuedB",
-        "double",
         -2000.0,
         "Transients are ignored if the ratemap's level is below this (dB); -2000: never",
         -2000.0,

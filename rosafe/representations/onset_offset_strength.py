@@ -17,7 +17,7 @@ SILENCE = 1e-200  # lower rates are raised to this: -2000 dB
 
 
 def _limit(name: str, what: str) -> Parameter:
-    return Parameter(name, "double", 30.0, f"Upper limit of {what} strength (dB)", 0.0, 1000.0, True, unit="dB")
+    return Parameter.positive(name, 30.0, f"Upper limit of {what} strength (dB)", 1000.0, unit="dB")
 
 
 class _Strength(Stage):

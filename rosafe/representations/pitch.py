@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from rosafe.declarations.parameter import Parameter
@@ -76,32 +77,20 @@ class Pitch(Stage):
                 ascending=True,
                 unit="Hz",
             ),
-            Parameter(
+            Parameter.real(
                 "pi_confThres",
-                "double",
                 0.7,
                 "Minimum confidence, relative to the greatest of the last 5 s",
                 0.0,
                 1.0,
                 aliases=("p_confThresPerc",),
             ),
-            Parameter(
-                "pi_medianOrder",
-                "unsigned long",
-                3,
-                "Frames of the median",
-                1,
-                MAX_ORDER,
-                aliases=("p_orderMedFilt",),
-            ),
-            Parameter(
+            Parameter.count("pi_medianOrder", 3, "Frames of the median", 1, MAX_ORDER, aliases=("p_orderMedFilt",)),
+            Parameter.positive(
                 "pi_peakRatio",
-                "double",
                 1.0,
                 "Least height of a peak at half the lag of the highest, relative to it, that is used in its place",
-                0.0,
                 1.0,
-                open_minimum=True,
             ),
         ),
         port_doc="pitch (Hz), rawPitch (Hz) and confidence as channels",
@@ -245,14 +234,7 @@ def running_maximum(before: FloatArray, values: FloatArray, reach: int) -> tuple
 
     No value is below 0. `before` (2, n) are the values before the first.
     """
-    past = before[:, max(0, before.shape[1] - reach + 1) :]
-    past = np.concatenate((np.zeros((len(past), reach - 1 - past.shape[1])), past, values), axis=1)
-    greatest = np.empty(values.shape)
-    for first in range(0, values.shape[1], reach):
-        part = slice(first, first + reach)
-        greatest[:, part] = np.maximum.accumulate(values[:, part], axis=1)
-        # the maximum from each earlier value to the last of them
-        ends = np.maximum.accumulate(past[:, first : first + reach - 1][:, ::-1], axis=1)[:, ::-1]
-        both = greatest[:, part][:, : reach - 1]
-        np.maximum(both, ends[:, : both.shape[1]], out=both)
-    return np.concatenate((before, values), axis=1)[:, -reach:], greatest
+    joined = np.concatenate((before, values), axis=1)
+    # the window of each value ends with it
+    greatest = scipy.ndimage.maximum_filter1d(joined, reach, axis=1, mode="constant", origin=(reach - 1) // 2)
+    return joined[:, -reach:], greatest[:, before.shape[1] :]

@@ -15,8 +15,7 @@ from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Derived, Part, Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import BATCH, FrameBuffer, FramedStage, frame_parameters
-from rosafe.dsp.kernels import precedence as by_kernel
-from rosafe.dsp.kernels.precedence import INTERLEAVED_ROWS, TAPS, Taps, Windowed
+from rosafe.dsp.kernels import INTERLEAVED_ROWS, TAPS, Taps, Windowed
 from rosafe.dsp.numeric_limits import EPSILON, SQUARE_TINY, TINY, FloatArray, clamp
 from rosafe.dsp.rounding import check_length, round_half_away
 from rosafe.dsp.signal_format import SignalFormat
@@ -96,15 +95,8 @@ class Precedence(FramedStage):
         parameters=(
             replace(frame_parameters("prec")[1], minimum=MAX_LAG_SECONDS),
             frame_parameters("prec")[2],
-            Parameter(
-                "prec_maxDelaySec",
-                "double",
-                0.001,
-                "Maximum delay in cross-correlation computation (s)",
-                0.0,
-                10.0,
-                open_minimum=True,
-                unit="s",
+            Parameter.positive(
+                "prec_maxDelaySec", 0.001, "Maximum delay in cross-correlation computation (s)", 10.0, unit="s"
             ),
         ),
         derived=(Derived("prec_lags", "sequence<double>", "The lags, ascending", unit="s"),),
@@ -159,7 +151,7 @@ class Precedence(FramedStage):
             part = slice(first, min(first + at_once, count))
             batch = buffers.first(part.stop - first)
             if compiled:
-                by_kernel.windowed(frames.part(first, part.stop - first), batch)
+                kernels.windowed(frames.part(first, part.stop - first), batch)
             else:
                 windowed(views[..., part, :], self._framing.window, batch)
             self._localise(batch, itd[:, part], ild[:, part], cc[..., part])
@@ -234,7 +226,7 @@ class Precedence(FramedStage):
         factors = np.where(
             active > MAX_FEW_ACTIVE, 1.0, np.divide(1.0, energies, out=np.zeros_like(energies), where=strong)
         )
-        add = by_kernel.add_spectra if kernels.compiled() and self._points <= kernels.MAX_POINTS else add_spectra
+        add = kernels.add_spectra if kernels.compiled() and self._points <= kernels.MAX_POINTS else add_spectra
         spectra = add(frames.samples, self._points, running.gains, factors, running.power)
         lags: FloatArray = scipy.fft.irfft(spectra, self._points)
         lags = lags[..., : self._last_delay + 1]
@@ -259,7 +251,7 @@ class Precedence(FramedStage):
         self, left: FloatArray, left_taps: Taps, right: FloatArray, right_taps: Taps, reach: int
     ) -> tuple[FloatArray, FloatArray]:
         few_lags = 2 * reach + 1 <= kernels.MAX_LAGS
-        correlate = by_kernel.correlate_filtered if kernels.compiled() and few_lags else correlate_filtered
+        correlate = kernels.correlate_filtered if kernels.compiled() and few_lags else correlate_filtered
         lags, energies = correlate(left, left_taps, right, right_taps, reach)
         lags[np.abs(lags) < NOISE * np.sqrt(energies[0] * energies[1])[..., np.newaxis]] = 0.0
         return lags, energies

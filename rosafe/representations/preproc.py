@@ -32,61 +32,42 @@ class PreProc(Stage):
         parent="input",
         axes=("ear", "time"),
         parameters=(
-            Parameter("pp_bRemoveDC", "boolean", False, "Flag to activate the DC-removal high-pass filter"),
-            Parameter(
-                "pp_cutoffHzDC",
-                "double",
-                20.0,
-                "Cutoff frequency (Hz) of DC-removal high-pass filter",
-                minimum=0.0,
-                maximum=1e6,
-                open_minimum=True,
-                unit="Hz",
+            Parameter.flag("pp_bRemoveDC", False, "Flag to activate the DC-removal high-pass filter"),
+            Parameter.positive(
+                "pp_cutoffHzDC", 20.0, "Cutoff frequency (Hz) of DC-removal high-pass filter", 1e6, unit="Hz"
             ),
-            Parameter("pp_bPreEmphasis", "boolean", False, "Flag to activate pre-emphasis"),
-            Parameter(
+            Parameter.flag("pp_bPreEmphasis", False, "Flag to activate pre-emphasis"),
+            Parameter.real(
                 "pp_coefPreEmphasis",
-                "double",
                 0.97,
                 "Coefficient for pre-emphasis compensation (usually between 0.9 and 1)",
-                minimum=-1.0,
-                maximum=1.0,
+                -1.0,
+                1.0,
             ),
-            Parameter("pp_bNormalizeRMS", "boolean", False, "Flag to activate binaural RMS normalization"),
-            Parameter(
-                "pp_intTimeSecRMS",
-                "double",
-                0.5,
-                "Time constant (s) for automatic gain control",
-                minimum=0.0,
-                maximum=3600.0,
-                open_minimum=True,
-                unit="s",
+            Parameter.flag("pp_bNormalizeRMS", False, "Flag to activate binaural RMS normalization"),
+            Parameter.positive(
+                "pp_intTimeSecRMS", 0.5, "Time constant (s) for automatic gain control", 3600.0, unit="s"
             ),
-            Parameter("pp_bLevelScaling", "boolean", False, "Flag to activate the level scaling"),
-            Parameter(
+            Parameter.flag("pp_bLevelScaling", False, "Flag to activate the level scaling"),
+            Parameter.real(
                 "pp_refSPLdB",
-                "double",
                 100.0,
                 "Reference dB SPL value to correspond to input signal RMS value of 1",
-                minimum=-200.0,
-                maximum=400.0,
+                -200.0,
+                400.0,
                 aliases=("pp_refSPLdBS",),
                 unit="dB",
             ),
-            Parameter("pp_bMiddleEarFiltering", "boolean", False, "Flag to activate middle ear filtering"),
-            Parameter(
+            Parameter.flag("pp_bMiddleEarFiltering", False, "Flag to activate middle ear filtering"),
+            Parameter.text(
                 "pp_middleEarModel",
-                "string",
                 "jepsen",
                 "Middle ear filter model (jepsen or lopezpoveda)",
-                choices=tuple(MODELS),
+                MODELS,
                 fallback="jepsen",
                 spellings={"jespen": "jepsen"},  # as in the user guide
             ),
-            Parameter(
-                "pp_bUnityComp", "boolean", False, "Compensation to have maximum of unity gain for middle ear filter"
-            ),
+            Parameter.flag("pp_bUnityComp", False, "Compensation to have maximum of unity gain for middle ear filter"),
         ),
         name_doc="The name of this activity",
         request="PreProc",

@@ -32,24 +32,16 @@ class Ratemap(FramedStage):
         amplitude_choice=("rm_scaling", "magnitude"),
         parameters=(
             *frame_parameters("rm"),
-            Parameter(
+            Parameter.text(
                 "rm_scaling",
-                "string",
                 "power",
                 "Scaling type (power or magnitude)",
-                choices=("power", "magnitude"),
+                ("power", "magnitude"),
                 fallback="power",
                 former=("set_rm_scailing",),
             ),
-            Parameter(
-                "rm_decaySec",
-                "double",
-                0.008,
-                "Signal-smoothing leaky integrator time constant (s)",
-                0.0,
-                3600.0,
-                open_minimum=True,
-                unit="s",
+            Parameter.positive(
+                "rm_decaySec", 0.008, "Signal-smoothing leaky integrator time constant (s)", 3600.0, unit="s"
             ),
         ),
         request_aliases=("Ratemap",),

@@ -248,9 +248,8 @@ def _check_coordinates(kind: Representation, result: Mapping[str, Any]) -> None:
     rate = result.get(f"{kind.kind}_frameRate", 1.0)
     if not is_number(rate) or not 0 < rate < math.inf:
         raise ValueError(f"{kind.kind}_frameRate: expected a positive number, got {short_repr(rate)}")
-    units = {one.name: one.unit for one in kind.parameters} | {one.name: one.unit for one in kind.derived}
     for name in kind.coordinates:
-        if units[name]:
+        if kind.units[name]:
             _check_array(name, result.get(name, np.empty(0)), 1)
         elif not is_texts(result.get(name, ())):
             raise ValueError(f"{name}: expected texts")

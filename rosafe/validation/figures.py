@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -86,7 +87,10 @@ class Panel:
 
 @dataclass(frozen=True)
 class Published:
-    """A figure: name of its file, heading, source and short name of the published values, labels, remark, panels."""
+    """A figure: heading, source and short name of the published values, labels and remark, as in figures.json; panels.
+
+    `name` is that of its file.
+    """
 
     name: str
     heading: str
@@ -94,49 +98,29 @@ class Published:
     short: str
     labels: tuple[str, str]
     remark: str
-    panels: tuple[Panel, ...]
+    panels: Sequence[Panel]
 
 
-def published_figures(process: Process) -> tuple[Published, ...]:
+def published_figures(process: Process) -> list[Published]:
     """Compute all figures with a function like `process`."""
-    return (_precedence(process), _drnl(process), _adaptation(process))
+    texts = json.loads(Path(__file__).with_name("figures.json").read_text("utf-8"))
+    panels = {"precedence": _precedence(process), "drnl": _drnl(process), "adaptation": _adaptation(process)}
+    return [Published(f"figures-{name}", **texts[name], panels=panels[name]) for name in texts]
 
 
-def _precedence(process: Process) -> Published:
+def _precedence(process: Process) -> list[Panel]:
     panels = []
     for level, expected in published.BRAASCH_ITD.items():
         curves = []
         for window in (0.02, 0.05):
             found = [lateral_itd(process, float(delay), level, window) for delay in published.BRAASCH_DELAYS]
             curves.append((f"rosAFE, {1e3 * window:g} ms", np.array(found)))
-        panels.append(
-            Panel(
-                f"lag of {level:+d} dB" if level else "lag of equal level",
-                published.BRAASCH_DELAYS,
-                np.array(expected),
-                tuple(curves),
-            )
-        )
-    return Published(
-        "figures-precedence",
-        "Precedence effect: lead and lag",
-        published.BRAASCH_SOURCE,
-        "program of Braasch (2013)",
-        ("delay of the lag (ms)", "ITD (ms)"),
-        "Noise of 200 ms from 100 to 900 Hz; the lead has an ITD of 0.3 ms, the lag one of -0.3 ms. The ITD is the "
-        "centroid of those parts of the correlation, summed over channels and frames, that exceed half of its "
-        "maximum. The author's program analyses the whole sound at once, normalises the four correlations between "
-        "which it chooses, and sums correlations weighted by energy. `precedence`, like the Two!Ears front-end, "
-        "analyses frames of `prec_wSizeSec`, compares correlations that are not normalised, and outputs normalised "
-        "correlations. So the lead dominates for a lag of -6 dB, and with windows of 50 ms for a lag of -3 dB. "
-        "With the default windows of 20 ms, it holds at -3 dB up to delays of about 5 ms. At equal level it holds "
-        "in part, best at 3 ms; with the default windows, the ITD is near 0 from 6 ms on. If the lag is louder, "
-        "rosAFE follows the lag with the default windows, and the author's program the lead.",
-        tuple(panels),
-    )
+        title = f"lag of {level:+d} dB" if level else "lag of equal level"
+        panels.append(Panel(title, published.BRAASCH_DELAYS, np.array(expected), tuple(curves)))
+    return panels
 
 
-def _drnl(process: Process) -> Published:
+def _drnl(process: Process) -> list[Panel]:
     rate, velocities = 44100.0, 10 ** np.arange(-10, -4.4, 0.5)
     panels = []
     for frequency, (centre, width, gain, best, narrow, slope, scale) in published.LOPEZPOVEDA_TABLE_2.items():
@@ -148,41 +132,15 @@ def _drnl(process: Process) -> Published:
         )
         expected = listener.output(velocities, frequency, rate)
         panels.append(Panel(f"{frequency} Hz", 20 * np.log10(velocities), expected, curves))
-    return Published(
-        "figures-drnl",
-        "DRNL: input-output functions",
-        published.LOPEZPOVEDA_SOURCE,
-        "parameters of Lopez-Poveda and Meddis (2001)",
-        ("stapes velocity (dB re 1 m/s)", "output (dB)"),
-        "Tones at the frequency of the channel. rosAFE, like the Two!Ears front-end, has the parameters of Jepsen "
-        "et al. (2008), which have fewer sections of filters and other gains. Its curves coincide with the closed "
-        "form for these parameters. The distance to the dots is the difference of the two publications.",
-        tuple(panels),
-    )
+    return panels
 
 
-def _adaptation(process: Process) -> Published:
-    times = published.BURST_TIMES[1:]
-    panels = tuple(
-        Panel(
-            f"{level} dB SPL",
-            times,
-            np.array(values[1:]),
-            (("rosAFE", burst_response(process, level, 10.0, times)),),
-            True,
-        )
-        for level, values in published.AMT_BURST.items()
-    )
-    return Published(
-        "figures-adaptation",
-        "Adaptation loops: overshoot",
-        published.AMT_SOURCE,
-        "AMT",
-        ("time after the onset (ms)", "output (MU)"),
-        "Constant input of 500 ms. The output falls from the limited overshoot to the steady response, which is "
-        "near the level in dB.",
-        panels,
-    )
+def _adaptation(process: Process) -> list[Panel]:
+    panels, times = [], published.BURST_TIMES[1:]
+    for level, values in published.AMT_BURST.items():
+        curves = (("rosAFE", burst_response(process, level, 10.0, times)),)
+        panels.append(Panel(f"{level} dB SPL", times, np.array(values[1:]), curves, True))
+    return panels
 
 
 def write_published(folder: Path, process: Process) -> list[Path]:
@@ -216,17 +174,9 @@ def _published_panel(axes: Axes, pair: tuple[Published, Panel]) -> None:
     axes.legend(fontsize=7.5, frameon=False)
 
 
-FIGURES_HEAD = """# Published figures
-
-For hearing scientists: curves of publications with the same curves of rosAFE. `rosafe validate --figures FOLDER`
-writes this page and its pictures. Each figure says how its published values were obtained. [Validation](validation.md)
-contains the comparisons with tolerances.
-"""
-
-
 def published_markdown(figures: Sequence[Published]) -> str:
     """Return the page."""
-    lines = [FIGURES_HEAD]
+    lines = [Path(__file__).with_name("figures_head.md").read_text("utf-8")]
     for figure in figures:
         lines += [f"## {figure.heading}\n", f"![{figure.heading}]({figure.name}.png)\n"]
         lines += [f"Published values: {figure.source}\n", f"{figure.remark}\n"]

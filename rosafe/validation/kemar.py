@@ -9,15 +9,7 @@ import scipy.signal
 
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization.sofa import HorizontalResponses, read_sofa
-from rosafe.validation.comparison import (
-    KEMAR,
-    Collection,
-    Curve,
-    Measured,
-    Process,
-    scaled,
-    shifted,
-)
+from rosafe.validation.comparison import KEMAR, Collection, Curve, Measured, Process, scaled, shifted
 from rosafe.validation.stimuli import largest, noise
 
 ROWS = Collection()

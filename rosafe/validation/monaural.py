@@ -10,15 +10,7 @@ import scipy.stats
 
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface.remarks import PRESETS
-from rosafe.validation.comparison import (
-    Collection,
-    Curve,
-    Measured,
-    Process,
-    altered,
-    parameter,
-    scaled,
-)
+from rosafe.validation.comparison import Collection, Curve, Measured, Process, altered, parameter, scaled
 from rosafe.validation.stimuli import THROUGH, both, complex_tone, largest, noise, through, tone
 
 ROWS = Collection()

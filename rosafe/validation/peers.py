@@ -9,14 +9,7 @@ import numpy as np
 
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface.remarks import PRESETS
-from rosafe.validation.comparison import (
-    Collection,
-    Curve,
-    Measured,
-    Process,
-    parameter,
-    scaled,
-)
+from rosafe.validation.comparison import Collection, Curve, Measured, Process, parameter, scaled
 from rosafe.validation.stimuli import both, complex_tone, largest, noise
 
 ROWS = Collection()

@@ -1,4 +1,4 @@
-"""Published values for the figures, each with its source and the way in which it was obtained."""
+"""Published values for the figures. figures.json has the source of each, and the way in which it was obtained."""
 
 from __future__ import annotations
 
@@ -6,13 +6,6 @@ import numpy as np
 
 # Lateralization of a lead and a lag: ITD in ms, mean of three noises, for delays of the lag in ms; by the level of the
 # lag relative to the lead in dB. The stimulus is `lead_lag` of binaural.py.
-BRAASCH_SOURCE = (
-    "Braasch (2013): computed, not read from the article, which was not at hand. A transcription of the author's "
-    "program `acmod` ran in GNU Octave 7.3 with the same sounds. Two parts of the program were not at hand and "
-    "were replaced: the gammatone filterbank of AMT (by filters of order 4 with 1.018 ERB, one per ERB from 100 "
-    "to 1400 Hz), and the filter for a lag that is stronger than the lead (by that of `precedence`). The second "
-    "concerns the values at 4 dB, and some of those at equal level."
-)
 BRAASCH_DELAYS = np.arange(1, 9)
 BRAASCH_ITD: dict[int, tuple[float, ...]] = {
     -6: (0.1920, 0.2807, 0.2783, 0.2789, 0.2660, 0.2842, 0.2892, 0.2837),
@@ -25,11 +18,6 @@ BRAASCH_ITD: dict[int, tuple[float, ...]] = {
 # the low-pass) and width of the compressive path, a, b. The exponent c is 0.25; there are three gammatone sections
 # before the compression, three gammatone and three low-pass sections after it, and three gammatone and four low-pass
 # sections in the linear path.
-LOPEZPOVEDA_SOURCE = (
-    "Lopez-Poveda and Meddis (2001), Table II, parameters of the average listener: printed numbers, taken from "
-    "`exp_lopezpoveda2001` of AMT, whose comments name the table. The curves are closed forms with these "
-    "parameters, not read from a figure. The article was not at hand."
-)
 LOPEZPOVEDA_TABLE_2 = {
     250: (244, 100, 1150, 250, 84, 2194, 0.45),
     500: (480, 130, 850, 500, 103, 5184, 0.28),
@@ -41,11 +29,6 @@ LOPEZPOVEDA_TABLE_2 = {
 
 # Adaptation loops with an overshoot limit of 10: output in model units at times in ms after the onset of a constant
 # input of 500 ms at 16 kHz; by its level in dB SPL.
-AMT_SOURCE = (
-    "Dau et al. (1996, 1997), adaptation loops with an overshoot limit of 10: computed, not read from the "
-    "articles. A transcription of `comp_adaptloop` of AMT 0.9.9 (Ewert, Jepsen, Soendergaard) ran in GNU Octave "
-    "7.3."
-)
 BURST_TIMES = np.array([0.0, 1, 2, 5, 10, 20, 50, 100, 200, 499])
 AMT_BURST = {
     20: (1280.3281, 694.87358, 488.79455, 287.71873, 192.39134, 120.03231, 50.360925, 25.986573, 18.567921, 17.249719),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rosafe.dsp.numeric_limits import FloatArray
@@ -149,55 +151,10 @@ def line(row: Row, disturbed: bool = False) -> str:
     return f"{verdict:12}{name}{about}: {_amount(row)}, tolerance {comparison.tolerance:g}; {comparison.source}"
 
 
-HEAD = """# Validation
-
-For hearing scientists: comparisons of numbers of rosAFE with expected numbers. The tables separate the comparisons by
-the origin of the expected number, because only the first kind shows that a representation is right. The last of these
-commands writes the page:
-
-```sh
-rosafe validate                        # a line for each comparison; without network
-rosafe validate --short                # without other toolboxes
-rosafe validate --self-test            # each comparison has to detect a small error of its representation
-rosafe validate -o validation.md       # this page and its pictures
-```
-
-"Parameters" are recorded from the calls of the function under test: the sample rates, and each parameter that is not a
-default. If the calls differ in a parameter, its first and last values are shown. "Criterion" says how the deviation
-is computed. "Error" is the one that `--self-test` introduces, and the deviation with it, which has to exceed
-the tolerance.
-
-Comparisons with other toolboxes are skipped if these are not installed; `pip install gammatone pyfar librosa
-python-auditory-toolbox` installs all of them. KEMAR needs Debian's libmysofa1 and h5py, the talkers alsa-utils.
-[Published figures](figures.md) shows curves of publications with the same curves of rosAFE.
-"""
-
-SECTIONS = {
-    INDEPENDENT: """## Independent comparisons
-
-The expected number comes from a publication, a closed form, a measurement, another program, or a sound whose property
-is known. An error in any stage of the chain shows.
-""",
-    STAGE: """## One stage alone
-
-Another program computes the stage from the project's own input of that stage, which is an output of the stage before.
-An error of that stage shows; an error of an earlier stage does not.
-""",
-    DEFINITION: """## Own definition
-
-The expected number follows from the definition that rosAFE, or the original Two!Ears front-end, has chosen. These
-comparisons show that the program computes its definition. They do not show that the definition is right.
-""",
-    LIMITATION: """## Limitations
-
-These numbers have no tolerance and count neither as passed nor as failed. They show how far the representations can be
-trusted, mostly with the original's defaults. [Onset maps](onset-maps.md) describes the first ones.
-""",
-}
-TABLE = """| representation | quantity | reference | parameters | criterion | deviation | tolerance | passed | error |
-|---|---|---|---|---|--:|--:|---|---|"""
-LIMITATIONS_TABLE = """| representation | quantity | reference | parameters | criterion | value |
-|---|---|---|---|---|--:|"""
+_HEAD, *_SECTIONS = re.split(
+    "^(?=## )", Path(__file__).with_name("validation_template.md").read_text("utf-8"), flags=re.M
+)
+SECTIONS = dict(zip((INDEPENDENT, STAGE, DEFINITION, LIMITATION), _SECTIONS, strict=True))  # text and head of the table
 
 
 def markdown(rows: Sequence[Row], disturbed: Sequence[Row], pictures: Mapping[str, str]) -> str:
@@ -211,24 +168,18 @@ def markdown(rows: Sequence[Row], disturbed: Sequence[Row], pictures: Mapping[st
         The names of the pictures by their descriptions.
     """
     errors = {row.comparison: row for row in disturbed}
-    lines = [HEAD, f"Version {VERSION}: {_summary(rows)}\n"]
-    for evidence, introduction in SECTIONS.items():
-        members = [row for row in rows if row.comparison.evidence == evidence]
-        if not members:
-            continue
-        table = LIMITATIONS_TABLE if evidence == LIMITATION else TABLE
-        lines += [introduction, table, *(_markdown_row(row, errors.get(row.comparison)) for row in members), ""]
+    lines = [_HEAD + f"Version {VERSION}: {_summary(rows)}\n"]
+    for evidence, section in SECTIONS.items():
+        if members := [row for row in rows if row.comparison.evidence == evidence]:
+            table = "\n".join(_markdown_row(row, errors.get(row.comparison)) for row in members)
+            lines.append(f"{section.rstrip()}\n{table}\n")
     lines += ["## Pictures\n", *(f"![{text}]({name})\n" for text, name in pictures.items())]
     return "\n".join(lines).rstrip() + "\n"
 
 
 def _summary(rows: Sequence[Row]) -> str:
     parts = []
-    for evidence, name in {
-        INDEPENDENT: "independent",
-        STAGE: "single stages",
-        DEFINITION: "own definitions",
-    }.items():
+    for evidence, name in {INDEPENDENT: "independent", STAGE: "single stages", DEFINITION: "own definitions"}.items():
         members = [row for row in rows if row.comparison.evidence == evidence and not row.skipped]
         parts.append(f"{sum(row.passed for row in members)} of {len(members)} {name}")
     checked = [row for row in rows if row.comparison.disturbance and not row.skipped]

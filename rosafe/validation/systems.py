@@ -16,15 +16,7 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization.enhancement import enhance
 from rosafe.localization.head import Head
 from rosafe.localization.localize import localize
-from rosafe.validation.comparison import (
-    KEMAR,
-    Collection,
-    Measured,
-    Origin,
-    Process,
-    altered,
-    late,
-)
+from rosafe.validation.comparison import KEMAR, Collection, Measured, Origin, Process, altered, late
 from rosafe.validation.kemar import head, response
 from rosafe.validation.stimuli import TALKERS, largest, talker
 

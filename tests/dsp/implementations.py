@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from rosafe.dsp import kernels
-from rosafe.dsp.kernels import build, loader, precedence
+from rosafe.dsp.kernels import build, loader
 
 from . import foreign
 
@@ -60,8 +60,7 @@ def using(choice: Choice) -> Iterator[None]:
         if choice in foreign.MACHINES:
             elsewhere = foreign.running(str(choice))
             loaded = (elsewhere, loader.Status(True, f"{choice}, for a test"))
-            for module in (kernels, precedence):
-                patch.setattr(module, "_address", elsewhere.address)
+            patch.setattr(kernels, "_address", elsewhere.address)
         elif choice == CLANG:
             loaded = (_by_clang(), loader.Status(True, "clang's, for a test"))
         elif isinstance(choice, int) and choice != NUMPY:

@@ -18,7 +18,6 @@ from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer, FrameGrid
 from rosafe.dsp.gammatone import TURN_SPAN, GammatoneBank
 from rosafe.dsp.kernels import build
-from rosafe.dsp.kernels import precedence as by_kernel
 from rosafe.dsp.numeric_limits import LIMIT
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
@@ -317,9 +316,9 @@ def test_windowed_frames(
             batch = max(1, count // parts)
             for first in range(0, count, batch):
                 number = min(batch, count - first)
-                got, expected = (by_kernel.Windowed.allocate(number, channels, len(window)) for _ in range(2))
+                got, expected = (kernels.Windowed.allocate(number, channels, len(window)) for _ in range(2))
                 with using(level):
-                    by_kernel.windowed(frames.part(first, number), got)
+                    kernels.windowed(frames.part(first, number), got)
                 precedence.windowed(wanted[:, :, first : first + number], window, expected)
                 for mine, theirs in zip(got, expected, strict=True):
                     agree([mine], [theirs])
@@ -339,13 +338,13 @@ def test_summed_spectra(level: Choice, channels: int, frames: int, half: int, po
         running.begin(np.full(channels, 500.0), points // 2 + 1, 1)
         rng, made = np.random.default_rng(half), []
         with using(choice):
-            add = precedence.add_spectra if choice == NUMPY else by_kernel.add_spectra
+            add = precedence.add_spectra if choice == NUMPY else kernels.add_spectra
             for _ in range(2):
                 samples = rng.standard_normal((frames, 2, channels, 2 * half)) * 10 ** rng.uniform(-3, 3)
                 factors = np.where(rng.random((frames, 2, channels)) < 0.3, 0, rng.random((frames, 2, channels)))
                 made.append(add(samples, points, gains, factors, running.power).T)
         rows = np.arange(2 * channels)
-        made.append(running.power[rows // by_kernel.INTERLEAVED_ROWS, :, rows % by_kernel.INTERLEAVED_ROWS].T)
+        made.append(running.power[rows // kernels.INTERLEAVED_ROWS, :, rows % kernels.INTERLEAVED_ROWS].T)
         sums[choice] = made
     for got, expected in zip(sums[level], sums[NUMPY], strict=True):
         agree([got], [expected])
@@ -366,7 +365,7 @@ def test_correlations_of_filtered_frames(
 ) -> None:
     """Both kinds of filters, with delays up to more than a frame; some without an echo."""
     rng = np.random.default_rng(seed)
-    ears: list[tuple[FloatArray, by_kernel.Taps]] = []
+    ears: list[tuple[FloatArray, kernels.Taps]] = []
     made = {}
     for _ in range(2):
         shape = (frames, 1 if alike else rows)
@@ -375,10 +374,10 @@ def test_correlations_of_filtered_frames(
         shifts = np.where(large, np.arange(6) - 6, np.arange(6)) * delays
         values = np.where(rng.random((*shape, 6)) < 0.2, 0.0, rng.standard_normal((*shape, 6)))
         samples = rng.standard_normal((frames, 2, rows, size))[:, 0]  # rows that are not contiguous
-        ears.append((samples, by_kernel.Taps(shifts, values)))
+        ears.append((samples, kernels.Taps(shifts, values)))
     for choice in (NUMPY, level):
         with using(choice):
-            correlate = precedence.correlate_filtered if choice == NUMPY else by_kernel.correlate_filtered
+            correlate = precedence.correlate_filtered if choice == NUMPY else kernels.correlate_filtered
             made[choice] = correlate(*ears[0], *ears[1], reach)
     for got, expected in zip(made[level], made[NUMPY], strict=True):
         agree([got], [expected], least=1.0)  # rounding errors of 0 in numpy are relative to the energies
@@ -508,8 +507,8 @@ def test_constants_are_those_of_the_sources() -> None:
     assert f"MAX_SECTIONS = {kernels.MAX_SECTIONS} " in sources["biquads.c"]
     assert f"MAX_LAGS = {kernels.MAX_LAGS}," in sources["correlation_blocks.h"]
     assert f"MAX_POINTS = {kernels.MAX_POINTS // 2} " in sources["fourier.h"]
-    assert f"TAPS = {by_kernel.TAPS} " in sources["precedence.c"]
-    assert f"INTERLEAVED_ROWS = {by_kernel.INTERLEAVED_ROWS} " in sources["precedence.c"]
+    assert f"TAPS = {kernels.TAPS} " in sources["precedence.c"]
+    assert f"INTERLEAVED_ROWS = {kernels.INTERLEAVED_ROWS} " in sources["precedence.c"]
     assert f"MAX_LOOPS = {kernels.MAX_LOOPS} " in sources["adaptation.c"]
     assert f"MAX_SIZE = {kernels.MAX_SIZE} " in sources["autocorrelation.c"]
     assert kernels.CLIPPINGS == ("clp", "clc", "sgn")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
-from rosafe.interface import BASS, files, ros2, rosafe
+from rosafe.interface import BASS, files, rosafe
 from rosafe.representations import registry
 from tests.harness import PYTHON, ROOT
 
@@ -39,18 +39,6 @@ def test_files_follow_the_table(tmp_path: Path) -> None:
 
     files.write(files.all_files(tmp_path, (component, BASS)))
     assert {path: path.read_text() for path in tmp_path.rglob("*.*")} == whole
-
-
-def test_files_of_ros_2_follow_the_declarations(tmp_path: Path) -> None:
-    folder = tmp_path / ros2.FOLDER
-    for kind in ("msg", "srv"):
-        (folder / kind).mkdir(parents=True)
-    (folder / "CMakeLists.txt").write_bytes((ROOT / ros2.FOLDER / "CMakeLists.txt").read_bytes())
-    (folder / "msg" / "Old.msg").touch()
-    files.write(ros2.all_files(tmp_path))
-    found = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.*")}
-    assert found == {path: (ROOT / ros2.FOLDER / path).read_bytes() for path in found}
-    assert len(found) == 1 + len(ros2.MESSAGES) + len(ros2.SERVICES)
 
 
 def children(kind: str) -> set[str]:

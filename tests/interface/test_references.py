@@ -121,9 +121,9 @@ def test_citation_file_is_complete() -> None:
     assert (found["version"], found["title"]) == (VERSION, citing.TITLE)
     assert {"cff-version", "message", "authors", "abstract", "keywords", "license", "type"} <= found.keys()
     cited = citing.references([KINDS[kind] for kind in BUILTIN], {})
-    assert [r.get("doi", "") for r in found["references"][1:]] == [one.doi for one in cited]
-    assert all(one["authors"] and one["title"] and one["year"] for one in found["references"][1:])
-    assert yaml.safe_load(citing.citation_file(cited)) == found
+    listed = [(one["title"], one["year"], one.get("doi", "")) for one in found["references"][1:]]
+    assert listed == [(one.title, one.year, one.doi) for one in cited]
+    assert all(one["authors"] for one in found["references"][1:])
 
 
 def test_page_lists_every_representation_and_entry() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -10,10 +11,11 @@ import pytest
 import rosafe
 from rosafe import interface
 from rosafe.declarations.idl import SCALARS
-from rosafe.interface import BASS, ROSAFE, ComponentSpec, Service, ros2
+from rosafe.interface import BASS, ROSAFE, ComponentSpec, Service
 from tests import harness
 
 FOLDERS = {"rosAFE": harness.ROOT, "bass": harness.ROOT / "bass"}
+OF_ROS_2 = harness.ROOT / "ros2" / "rosafe_msgs"
 REPLY = [("bool", "genom_success"), ("string", "genom_exdetail")]
 COMPONENTS = pytest.mark.parametrize("component", interface.COMPONENTS.values(), ids=lambda c: c.name)
 SERVICES = pytest.mark.parametrize(("component", "service"), list(interface.all_services()), ids=lambda x: x.name)
@@ -183,6 +185,11 @@ def test_messages_of_ros_2_have_the_fields_of_ros_1(package: str, name: str) -> 
     (own,) = parts(FOLDERS[package] / "msg" / f"{name}.msg")
     others = {"Header": "std_msgs/Header", "time": "builtin_interfaces/Time"}
     expected = [(others.get(kind, kind), field.replace("frameIndex", "frame_index")) for kind, field in own]
-    (found,) = parts(harness.ROOT / ros2.FOLDER / "msg" / f"{name}.msg")
+    (found,) = parts(OF_ROS_2 / "msg" / f"{name}.msg")
     assert found[: len(expected)] == expected
     assert all(field == field.lower() for _, field in found)
+
+
+def test_files_of_ros_2_are_listed() -> None:
+    listed = re.findall(r'^  "(\w+/\w+\.\w+)"$', (OF_ROS_2 / "CMakeLists.txt").read_text("utf-8"), re.MULTILINE)
+    assert listed == sorted(f"{path.parent.name}/{path.name}" for path in OF_ROS_2.glob("[ms][sr][gv]/*"))

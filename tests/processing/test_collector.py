@@ -9,7 +9,7 @@ import pytest
 
 import rosafe
 from rosafe.dsp import kernels
-from rosafe.processing.collector import OutputCollector
+from rosafe.processing.process import OutputCollector
 from rosafe.representations import STAGES
 from rosafe.representations.haircell import METHODS, InnerHairCell
 from tests.dsp.bare import cut

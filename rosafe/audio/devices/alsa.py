@@ -8,6 +8,7 @@ import os
 import select
 import threading
 import time
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -214,6 +215,7 @@ class DeviceBusyError(ComponentError):
         super().__init__(device_error(why).ex, why)
 
 
+@dataclass(frozen=True)
 class PcmOpener:
     """Opens a PCM as S32_LE with exactly the requested sample rate and period.
 
@@ -233,45 +235,41 @@ class PcmOpener:
         The period.
     """
 
-    def __init__(
-        self,
-        alsa: Any,
-        device: str,
-        pcm_name: str,
-        channels: tuple[int, int] | None,
-        sample_rate: int,
-        frames_per_chunk: int,
-    ) -> None:
-        self.alsa_error = alsa.ALSAAudioError
-        self._alsa = alsa
-        self._device = device
-        self._pcm_name = pcm_name
-        self._channels = channels
-        self._sample_rate = sample_rate
-        self._frames_per_chunk = frames_per_chunk
+    alsa: Any
+    device: str
+    pcm_name: str
+    channels: tuple[int, int] | None
+    sample_rate: int
+    frames_per_chunk: int
+
+    @property
+    def alsa_error(self) -> type[Exception]:
+        """The class of the errors of pyalsaaudio."""
+        error: type[Exception] = self.alsa.ALSAAudioError
+        return error
 
     def open(self) -> Any:
         """Return the open PCM. Raises ComponentError."""
-        if self._channels is None:
+        if self.channels is None:
             return self._open(2)
-        for count in range(max(self._channels), MAX_CHANNELS + 1):
+        for count in range(max(self.channels), MAX_CHANNELS + 1):
             pcm = self._open(count, exact_channels=False)
             if pcm is not None:
                 return pcm
-        raise hwparams_error(f"{self._device}: expected at least {max(self._channels)} channels, got fewer")
+        raise hwparams_error(f"{self.device}: expected at least {max(self.channels)} channels, got fewer")
 
     def _open(self, channels: int, exact_channels: bool = True) -> Any:
         """Return the open PCM; None if only the number of channels differs, and it need not be exact."""
         with captured_alsa_errors() as messages:
             try:
-                pcm = self._alsa.PCM(
-                    type=self._alsa.PCM_CAPTURE,
-                    mode=self._alsa.PCM_NONBLOCK,  # neither opening a busy device nor stopping a silent one may block
-                    device=self._pcm_name,
-                    rate=self._sample_rate,
+                pcm = self.alsa.PCM(
+                    type=self.alsa.PCM_CAPTURE,
+                    mode=self.alsa.PCM_NONBLOCK,  # neither opening a busy device nor stopping a silent one may block
+                    device=self.pcm_name,
+                    rate=self.sample_rate,
                     channels=channels,
-                    format=self._alsa.PCM_FORMAT_S32_LE,
-                    periodsize=self._frames_per_chunk,
+                    format=self.alsa.PCM_FORMAT_S32_LE,
+                    periodsize=self.frames_per_chunk,
                     periods=RING_CHUNKS,
                 )
             except self.alsa_error as problem:
@@ -283,20 +281,20 @@ class PcmOpener:
         pcm.close()
         if not exact_channels and info["channels"] != channels:
             return None
-        raise hwparams_error(f"{self._device}: {'; '.join(differences)}")
+        raise hwparams_error(f"{self.device}: {'; '.join(differences)}")
 
     def message(self, problem: Exception) -> str:
         """Return the text of pyalsaaudio's error without the name of the PCM."""
-        return str(problem).removesuffix(f" [{self._pcm_name}]")
+        return str(problem).removesuffix(f" [{self.pcm_name}]")
 
     def _open_error(self, text: str, messages: list[str]) -> ComponentError:
         """Return the error for a PCM that is missing, busy or broken, with the last message of libasound."""
         if text == os.strerror(errno.EINVAL) and not messages:  # libasound explains other failures to open
             return hwparams_error(
-                f"{self._device}: the device does not support {self._sample_rate} Hz with two channels of S32_LE"
+                f"{self.device}: the device does not support {self.sample_rate} Hz with two channels of S32_LE"
             )
         details = [detail for detail in (*messages[-1:], _HINTS.get(text)) if detail]
-        why = f"{self._device}: {text}" + (f" ({'; '.join(details)})" if details else "")
+        why = f"{self.device}: {text}" + (f" ({'; '.join(details)})" if details else "")
         return DeviceBusyError(why) if text == os.strerror(errno.EBUSY) else device_error(why)
 
     def _differences(self, pcm: Any, info: dict[str, Any], channels: int) -> list[str]:
@@ -304,17 +302,17 @@ class PcmOpener:
         differences = []
         if info["format_name"] != "S32_LE":
             formats = ", ".join(sorted(pcm.getformats())) or info["format_name"]
-            converter = ("plug" if self._pcm_name.startswith("hw:") else "plug:") + self._pcm_name
+            converter = ("plug" if self.pcm_name.startswith("hw:") else "plug:") + self.pcm_name
             differences.append(f"expected format S32_LE, got {formats}: use {converter}, which converts")
         if info["channels"] != channels:
             mono = ", or 1,1 for both ears" if info["channels"] == 1 else ""
             differences.append(
                 f"expected {channels} channels, got {info['channels']}: choose two with ?channels=1,2{mono}"
             )
-        if info["rate"] != self._sample_rate:
-            differences.append(f"expected {self._sample_rate} Hz, got {_rates_text(pcm.getrates())}")
-        elif info["period_size"] != self._frames_per_chunk:
-            differences.append(f"expected chunks of {self._frames_per_chunk} frames, got {info['period_size']}")
+        if info["rate"] != self.sample_rate:
+            differences.append(f"expected {self.sample_rate} Hz, got {_rates_text(pcm.getrates())}")
+        elif info["period_size"] != self.frames_per_chunk:
+            differences.append(f"expected chunks of {self.frames_per_chunk} frames, got {info['period_size']}")
         return differences
 
 

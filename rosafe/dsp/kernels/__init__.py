@@ -33,6 +33,8 @@ MAX_LAGS = 1024  # of a correlation; FFT is faster beyond
 MAX_LOOPS = 32  # of adaptation
 MAX_SIZE = 4096  # samples of a frame for autocorrelation
 MAX_POINTS = 8192  # real points of a Fourier transform
+TAPS = 6  # of a filter that removes an echo
+INTERLEAVED_ROWS = 8  # rows that are interleaved in memory
 
 REAL_SIZE = 8  # bytes of a float64
 _pack = struct.Struct(FRAMES).pack
@@ -63,18 +65,8 @@ def gammatone(
     envelope: FloatArray | None,
 ) -> None:
     """Apply gammatone filters, as `rosafe.dsp.gammatone.filter_by_scipy`. `output` has evenly strided rows."""
-    channels, order = sections.shape[:2]
-    _function("rosafe_gammatone")(
-        _address(block),
-        *block.shape,
-        channels,
-        order,
-        _address(sections),
-        _address(state),
-        position,
-        *_rows(output),
-        None if envelope is None else _address(envelope),
-    )
+    sizes = (*block.shape, *sections.shape[:2])
+    _call("rosafe_gammatone", block, *sizes, sections, state, position, *_rows(output), envelope)
 
 
 def rectify_and_filter(
@@ -91,17 +83,9 @@ def rectify_and_filter(
     equivalent is `RECTIFIERS` or `compressed` of rosafe/representations/haircell.py with
     `rosafe.dsp.sos_filter.SosFilter`.
     """
-    _function("rosafe_biquads")(
-        RECTIFICATIONS.index(rectification),
-        _address(block),
-        None if envelope is None else _address(envelope),
-        math.prod(block.shape[:-1]),
-        block.shape[-1],
-        _address(sections),
-        len(sections),
-        _address(state),
-        *_rows(output),
-    )
+    kind, rows = RECTIFICATIONS.index(rectification), math.prod(block.shape[:-1])
+    filters = (sections, len(sections), state)
+    _call("rosafe_biquads", kind, block, envelope, rows, block.shape[-1], *filters, *_rows(output))
 
 
 def adaptation(
@@ -121,19 +105,9 @@ def adaptation(
     output = buffer_pool.empty(block.shape)
     constants = np.stack((thresholds, offsets, gains), axis=1)
     loops = np.stack((decay_factors, 1 - decay_factors, limits), axis=1)
-    _function("rosafe_adaptation")(
-        _address(block),
-        math.prod(block.shape[:-1]),
-        block.shape[-1],
-        factor,
-        _address(constants),
-        len(constants),
-        _address(loops),
-        len(loops),
-        bool(limits.any()),
-        _address(state),
-        _address(output),
-    )
+    sizes = math.prod(block.shape[:-1]), block.shape[-1]
+    tables = (constants, len(constants), loops, len(loops))
+    _call("rosafe_adaptation", block, *sizes, factor, *tables, bool(limits.any()), state, output)
     return output
 
 
@@ -227,7 +201,7 @@ def level_differences(frames: FrameReader, epsilon: float) -> FloatArray:
     """
     channels = frames.block.shape[1]
     result, energies = np.empty((channels, frames.number)), np.empty((2 * channels, frames.number))
-    _function("rosafe_level_differences")(frames.packed, epsilon, _address(energies), _address(result))
+    _call("rosafe_level_differences", frames.packed, epsilon, energies, result)
     return result
 
 
@@ -239,7 +213,7 @@ def ratemap(frames: FrameReader, squared: bool, section: FloatArray, state: Floa
     `rosafe.dsp.framing.FrameGrid.means` after `rosafe.dsp.sos_filter.SosFilter`.
     """
     rates = np.empty((*frames.block.shape[:-1], frames.number))
-    _function("rosafe_ratemap")(frames.packed, squared, -section[0, 4], _address(state), _address(rates))
+    _call("rosafe_ratemap", frames.packed, squared, -section[0, 4], state, rates)
     return rates
 
 
@@ -251,7 +225,7 @@ def modulation(frames: FrameReader, sections: FloatArray, state: FloatArray) -> 
     `rosafe.dsp.sos_filter.SosFilterBank`.
     """
     means = np.empty((*frames.tail.store.array.shape[:-1], frames.number))
-    _function("rosafe_modulation")(frames.packed, len(sections), *map(_address, (sections, state, means)))
+    _call("rosafe_modulation", frames.packed, len(sections), sections, state, means)
     return means
 
 
@@ -261,14 +235,8 @@ def correlations(frames: FrameReader, reach: int, epsilon: float, output: FloatA
     2 reach + 1 is at most `MAX_LAGS`. The equivalent is `rosafe.representations.crosscorrelation.correlate_by_fft`.
     """
     _, lags, number = output.shape
-    outside = lags // 2 - reach
-    _function("rosafe_correlations")(
-        frames.packed,
-        reach,
-        epsilon,
-        _address(output) + outside * number * output.itemsize,
-        lags * number,
-    )
+    middle = _address(output) + (lags // 2 - reach) * number * output.itemsize
+    _call("rosafe_correlations", frames.packed, reach, epsilon, middle, lags * number)
 
 
 def spectral_features(
@@ -279,10 +247,7 @@ def spectral_features(
     The equivalent is `FEATURES` of rosafe/representations/spectralfeatures.py.
     """
     work = np.empty((4, spectra.shape[1]))
-    arrays = map(_address, (work, features))
-    _function("rosafe_spectral_features")(
-        _address(spectra), _address(last), *spectra.shape, _address(frequencies), bright, part, *arrays
-    )
+    _call("rosafe_spectral_features", spectra, last, *spectra.shape, frequencies, bright, part, work, features)
 
 
 def transient_map(
@@ -311,11 +276,10 @@ def transient_map(
         np.zeros((2, channels, 2 * spread - 1), np.int64),
         np.empty(spread, np.int64),
     )
-    peaks, *others = map(_address, buffers)
-    _function("rosafe_transient_map")(
-        *(_address(strengths), _address(levels), strengths.strides[1] // REAL_SIZE, ears * channels, channels),
-        *(first, count, reach, at_once, *thresholds, fuse, spread, peaks, capacity, *others, _address(output)),
-    )
+    peaks, *others = buffers
+    sizes = (strengths.strides[1] // REAL_SIZE, ears * channels, channels, first, count, reach, at_once)
+    rules = (*thresholds, fuse, spread)
+    _call("rosafe_transient_map", strengths, levels, *sizes, *rules, peaks, capacity, *others, output)
 
 
 def autocorrelations(
@@ -329,16 +293,8 @@ def autocorrelations(
     rows = frames.block.shape[:-1]
     output = buffer_pool.empty((*rows, len(corrections), frames.number))
     transform = Transform.of(2 * len(frames.weights.array) - 1)
-    _function("rosafe_autocorrelations")(
-        frames.packed,
-        CLIPPINGS.index(clipping),
-        alpha,
-        exponent / 2,
-        transform.points,
-        *map(_address, (transform.twiddles, transform.places, transform.turns, corrections)),
-        len(corrections),
-        _address(output),
-    )
+    clipped = (CLIPPINGS.index(clipping), alpha, exponent / 2)
+    _call("rosafe_autocorrelations", frames.packed, *clipped, *transform, corrections, len(corrections), output)
     return output
 
 
@@ -388,16 +344,7 @@ def gabor_responses(
     padded = np.zeros((ears, channels, frames + 2 * reach))
     padded[:, :, :length] = levels
     sums = np.empty((ears, len(places), frames))
-    _function("rosafe_gabor_responses")(
-        _address(padded),
-        ears,
-        channels,
-        frames,
-        reach,
-        _address(places),
-        len(places),
-        *map(_address, (weights, sums)),
-    )
+    _call("rosafe_gabor_responses", padded, ears, channels, frames, reach, places, len(places), weights, sums)
     return sums[:, :, :count]
 
 
@@ -412,14 +359,14 @@ def concatenate(blocks: Sequence[FloatArray], whole: FloatArray) -> None:
         return
     held = [np.ascontiguousarray(block) for block in blocks]
     table = np.array([[_address(block) for block in held], [block.shape[-1] for block in held]], np.int64)
-    _function("rosafe_concatenate")(len(held), *map(_address, table), math.prod(whole.shape[:-1]), *_rows(whole))
+    _call("rosafe_concatenate", len(held), *table, math.prod(whole.shape[:-1]), *_rows(whole))
 
 
 def mixture(likelihood: NDArray[np.float32], iterations: int, weights: NDArray[np.float32]) -> NDArray[np.float32]:
     """Compute the same as `rosafe.localization.mixture.fit_by_numpy`, for `DIRECTIONS` directions."""
     inverse = np.empty(len(likelihood), np.float32)
     likelihood = np.ascontiguousarray(likelihood)
-    _function("rosafe_mixture")(len(likelihood), _address(likelihood), iterations, _address(weights), _address(inverse))
+    _call("rosafe_mixture", len(likelihood), likelihood, iterations, weights, inverse)
     return inverse
 
 
@@ -455,15 +402,8 @@ class EvidenceTables(NamedTuple):
         factor: float,
     ) -> None:
         """Add the evidence of frames (n,) for some channels (C,), times `factor`, to `sums` (C, A)."""
-        _function("rosafe_add_evidence")(
-            self._packed(cues, floor),
-            self.step,
-            _address(frames),
-            len(frames),
-            _address(channels),
-            factor,
-            _address(sums),
-        )
+        packed = self._packed(cues, floor)
+        _call("rosafe_add_evidence", packed, self.step, frames, len(frames), channels, factor, sums)
 
     def units(
         self,
@@ -478,16 +418,82 @@ class EvidenceTables(NamedTuple):
         `factors` (2, C, K) are those of ITD and ILD in the classes of coherence of each channel.
         """
         evidence = np.empty((number, DIRECTIONS), np.float32)
-        _function("rosafe_unit_evidence")(
-            self._packed(cues, floor),
-            self.step,
-            _address(frames),
-            len(frames),
-            _address(factors),
-            factors[0].size,
-            _address(evidence),
-        )
+        packed = self._packed(cues, floor)
+        _call("rosafe_unit_evidence", packed, self.step, frames, len(frames), factors, factors[0].size, evidence)
         return evidence
+
+
+# --- precedence: windowed frames, summed spectra, correlations of filtered frames ----------------------------------
+
+
+class Windowed(NamedTuple):
+    """Windowed frames of both ears with their sums, peaks and energies."""
+
+    samples: FloatArray  # (F, 2, C, w)
+    sums: FloatArray  # over channels, (F, 2, w)
+    peaks: FloatArray  # the largest sample of each frame, (F, 2, C)
+    energies: FloatArray  # the sum of squares of each frame, (F, 2, C)
+
+    @classmethod
+    def allocate(cls, frames: int, channels: int, size: int) -> Windowed:
+        """Return uninitialised arrays."""
+        each = (frames, 2, channels)
+        return cls(np.empty((*each, size)), np.empty((frames, 2, size)), np.empty(each), np.empty(each))
+
+    def first(self, frames: int) -> Windowed:
+        """Return a view of the first frames."""
+        return Windowed(*(array[:frames] for array in self))
+
+
+class Taps(NamedTuple):
+    """Filters y[t] = sum_i values[i] x[t - shifts[i]]; y starts with x and is shifts[-1] samples longer."""
+
+    shifts: NDArray[np.int64]  # (..., TAPS), ascending
+    values: FloatArray  # (..., TAPS)
+
+    def of(self, *place: Any) -> Taps:
+        """Return the filters at an index."""
+        return Taps(self.shifts[place], self.values[place])
+
+
+def windowed(frames: FrameReader, output: Windowed) -> None:
+    """Write the frames of (2, C, N), multiplied by their weights, to `output`; the tail is not written.
+
+    The equivalent is `rosafe.representations.precedence.windowed`.
+    """
+    _call("rosafe_windowed", frames.packed, *output)
+
+
+def add_spectra(
+    samples: FloatArray, points: int, gains: FloatArray, factors: FloatArray, power: FloatArray
+) -> FloatArray:
+    """Compute `rosafe.representations.precedence.add_spectra` with a power of 2 up to MAX_POINTS points; w is even."""
+    count, ears, channels, size = samples.shape
+    transform = Transform.of(points)
+    sums, factors = np.empty((count, ears, power.shape[1])), np.ascontiguousarray(factors)
+    sizes = (channels, count, size)
+    _call("rosafe_add_spectra", samples, *sizes, gains, factors, *transform, power, sums)
+    return sums
+
+
+def correlate_filtered(
+    left: FloatArray, left_taps: Taps, right: FloatArray, right_taps: Taps, reach: int
+) -> tuple[FloatArray, FloatArray]:
+    """Compute `rosafe.representations.precedence.correlate_filtered` for at most MAX_LAGS lags."""
+    count, rows, size = left.shape
+    correlations, energies = np.empty((count, rows, 2 * reach + 1)), np.empty((2, count, rows))
+    longest = size + max(0, int(left_taps.shifts.max(initial=0)), int(right_taps.shifts.max(initial=0)))
+    scratch = np.empty(2 * MAX_LANES * (size + reach) + 2 * longest)
+    ears = [
+        (ear, *(step // REAL_SIZE for step in ear.strides[:2]), *map(np.ascontiguousarray, taps))
+        for ear, taps in ((left, left_taps), (right, right_taps))
+    ]
+    sizes = (count, rows, size, left_taps.shifts.shape[1] < rows, reach, longest)
+    _call("rosafe_correlate_filtered", *ears[0], *ears[1], *sizes, scratch, correlations, energies)
+    return correlations, energies
+
+
+# --- calls ----------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -499,18 +505,19 @@ def denormals_off() -> Iterator[None]:
     if not compiled():
         yield
         return
-    before = _function("rosafe_denormals_off")()
+    before = _call("rosafe_denormals_off")
     try:
         yield
     finally:
-        _function("rosafe_denormals_as")(before)
+        _call("rosafe_denormals_as", before)
 
 
-def _function(name: str) -> Any:
+def _call(name: str, *arguments: Any) -> Any:
+    """Call a function of the library; it gets the addresses of arrays."""
     library = loaded()[0]
     if library is None:
         raise RuntimeError(f"kernels are not available: {status().detail}")
-    return getattr(library, name)
+    return getattr(library, name)(*(_address(one) if isinstance(one, np.ndarray) else one for one in arguments))
 
 
 _BUFFER = ctypes.c_char * 0

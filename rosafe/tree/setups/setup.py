@@ -16,13 +16,13 @@ from rosafe.tree.tree_planner import ExistingProcessor, ProcessorSpec
 ACQUIRE = BASS.service("Acquire").parameters
 # The settings of the localizer node, which are also its private ROS parameters.
 LOCALIZER = (
-    Parameter("head", "string", "sphere", "Head: sphere, pair:SPACING (m), a SOFA file or a learned model"),
-    Parameter("mirror", "boolean", False, "Whether the labels of a SOFA file exchange left and right"),  # or absent
-    Parameter("seconds", "double", 0.5, "Window of integration", minimum=0.01, maximum=60.0, unit="s"),
-    Parameter("world_frame", "string", "", "Coordinate frame of the azimuths; empty: the frame of the head"),
-    Parameter("head_frame", "string", "head", "Coordinate frame of the head"),
-    Parameter("audio_delay", "double", 0.0, "Latency of the sound card", minimum=-5.0, maximum=5.0, unit="s"),
-    Parameter("noise", "string", "", "File of rosafe localize --calibrate-noise"),
+    Parameter.text("head", "sphere", "Head: sphere, pair:SPACING (m), a SOFA file or a learned model"),
+    Parameter.flag("mirror", False, "Whether the labels of a SOFA file exchange left and right"),  # or absent
+    Parameter.real("seconds", 0.5, "Window of integration", 0.01, 60.0, unit="s"),
+    Parameter.text("world_frame", "", "Coordinate frame of the azimuths; empty: the frame of the head"),
+    Parameter.text("head_frame", "head", "Coordinate frame of the head"),
+    Parameter.real("audio_delay", 0.0, "Latency of the sound card", -5.0, 5.0, unit="s"),
+    Parameter.text("noise", "", "File of rosafe localize --calibrate-noise"),
 )
 LOCALIZER_FILES = ("head", "noise")  # settings that name files
 INPUT_PORTS = tuple(port.name for port in ROSAFE.ports if not port.output)
