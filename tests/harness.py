@@ -24,7 +24,7 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -42,7 +42,6 @@ ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = ROOT / "scripts"
 PYTHON = "/usr/bin/python3"
 PATIENCE = 60.0  # s; time limit for any event, also on a busy machine: tests do not check durations
-END_SECONDS = 5.0  # s; within this time a server ends after a request to do so
 GRACE = 20.0  # s; from the request to end until a process is killed
 
 forks = False  # tests/conftest.py sets it: programs are started as forks if possible, except in tests of the start
@@ -130,6 +129,12 @@ def free_port() -> int:
 def can_fork(command: list[str], env: dict[str, str]) -> bool:
     """Return whether a program is started by the server of forks (tests/fork_server.py)."""
     return forks and fork_server.can_fork(command, env, generate.environment()["PYTHONPATH"])
+
+
+def run_program(command: Sequence[str | Path], **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a program to its end, and return its output as text. `options` are those of `subprocess.run`."""
+    usual = {"capture_output": True, "text": True, "timeout": 5 * PATIENCE, "check": False}
+    return subprocess.run(command, **{**usual, **options})
 
 
 class Process:

@@ -19,7 +19,7 @@ from rosafe.audio.devices.scene import Scene
 from rosafe.commands.__main__ import main
 from tests.audio import bags
 from tests.commands.command import ROSAFE, environment, refused, rosafe, start
-from tests.harness import PATIENCE, Graph, Process, free_port, wait_for
+from tests.harness import PATIENCE, Graph, Process, free_port, run_program, wait_for
 from tests.terminal import Terminal
 
 RATE = 8000
@@ -129,14 +129,10 @@ def test_signals_leave_a_complete_file(tmp_path: Path) -> None:
 
 def test_full_disk(wav: Path, tmp_path: Path) -> None:
     """Simulated by a limit of the file size; the recording up to that point is kept."""
-    done = subprocess.run(
+    done = run_program(
         ["prlimit", "--fsize=10003", str(ROSAFE), "record", "a.wav", "--device", f"file:{wav}", "--chunk", "100"],
         cwd=tmp_path,
         env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
     )
     assert done.returncode == 1 and done.stderr == "rosafe record: cannot write a.wav: File too large\n"
     samples = samples_of(tmp_path / "a.wav")

@@ -53,12 +53,6 @@ def acquire(graph: Graph, device: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def bass(graph: Graph) -> Iterator[Process]:
-    with graph.node("bass-ros") as process:
-        yield process
-
-
-@pytest.fixture(scope="module")
 def recorded(graph: Graph, bass: Process, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     """Send a file through bass and rosAFE while `rosbag record` is running."""
     folder = tmp_path_factory.mktemp("replay")

@@ -29,12 +29,6 @@ def audio_class() -> Any:
     return serialization.message_class("bass", "::binaudio::portStruct")
 
 
-@pytest.fixture(scope="module")
-def bass(graph: Graph) -> Iterator[Process]:
-    with graph.node("bass-ros") as process:
-        yield process
-
-
 @pytest.fixture
 def driver(graph: Graph) -> Iterator[Driver]:
     """A driver in this process with topics of its own; stamped messages of four channels."""
