@@ -155,7 +155,7 @@ def test_a_machine_with_ros_2_only(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     lost = doctor.Finding(doctor.MISSING, "it is not installed; help", "install it")
     for name in doctor.CHECKS:
         finding = lost if name in ("ROS", "alsaaudio", "plots") else doctor.Finding(doctor.OK, "here")
-        monkeypatch.setitem(doctor.CHECKS, name, lambda finding=finding: finding)
+        monkeypatch.setitem(doctor.CHECKS, name, lambda one=finding: one)  # type: ignore[misc]
     code = doctor.run(argparse.Namespace(json=True))
     found = findings(subprocess.CompletedProcess([], code, capsys.readouterr().out))
     needed = {
