@@ -33,7 +33,7 @@ def graph_without_master(tmp_path: Path) -> Iterator[harness.Graph]:
     "only",
     [
         pytest.param((), marks=pytest.mark.soak),  # everything takes minutes
-        ("cycles", "changes", "clients_of_the_socket", "a_message_of_4_gib"),
+        ("cycles", "changes", "clients_of_the_socket"),
     ],
     ids=",".join,
 )
