@@ -69,13 +69,6 @@ def open_files(pid: int) -> int:
     return len(list(proc(pid, "fd").iterdir()))
 
 
-def resident(pid: int) -> int:
-    """Return the memory of a process in MB."""
-    found = re.search(r"VmRSS:\s+(\d+)", proc(pid, "status").read_text())
-    assert found is not None
-    return int(found[1]) // 1024
-
-
 def served(world: World) -> None:
     """A new HTTP client and a new Tcl client are served."""
     assert list(world.http.call("rosAFE/getParameters", s=f"fresh{time.monotonic()}")) == ["parameters"]

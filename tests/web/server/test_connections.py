@@ -52,9 +52,6 @@ class Client:
         return await self.status()
 
 
-Connect = Callable[[], Awaitable[Client]]
-
-
 def _format(refusal: HttpRefusal) -> tuple[bytes, str]:
     return str(refusal).encode(), "text/plain"
 
