@@ -217,7 +217,11 @@ def _is_in(path: Path, folders: tuple[str, ...]) -> bool:
 
 
 def pytest_collection_finish() -> None:
-    """Leave the collected tests out of garbage collections, which would examine them again and again."""
+    """Leave the collected tests out of garbage collections, which would examine them again and again.
+
+    Imported modules may have changed variables that decide about forks (`rosafe.ros2` sets the threads of OpenBLAS).
+    """
+    fork_server.restore_environment()
     gc.collect()
     gc.freeze()
 
