@@ -66,7 +66,7 @@ def test_streams_are_those_of_the_file(
     monkeypatch.syspath_prepend(str(PYPI_DIR))
     assert {(m["sample_rate"], m["header"]["frame_id"]) for m in parts} == {(16000, "head")}
     of_parts = [Part(m["id"], math.degrees(m["azimuth"]), *numbered(m)) for m in parts]
-    ids = ids_of_file(of_parts, take, sphere_model)
+    ids = ids_of_file(of_parts, take, sphere_model, undisturbed=False)
     found = [source for message in client.take("sources") for source in message["sources"]]
     talker, music = ([float(one["speech"]) for one in found if one["id"] == ids[at]] for at in (TALKER, MUSIC))
     assert np.isnan(talker[0]), "less than 0.3 s"
