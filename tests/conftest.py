@@ -81,9 +81,13 @@ EACH_CASE = {  # of the cases of these tests, each n-th one runs in the normal s
     "dsp/test_kernels.py::test_autocorrelation": 4,
     "dsp/test_processors.py::test_every_kernel": 3,
     "web/genomix/test_guide.py::test_usage_patterns_of_published_scripts": 2,
+    "web/genomix/test_namespaces.py::test_commands": 2,
     "web/genomix/test_trouble.py::test_known_components_continue_without_a_master": 2,
     "ros1/localizer/test_attacks.py::test_frames_with_strange_values_and_indices": 2,
     "ros1/localizer/test_ear_check.py::test_the_command": 2,
+    "ros1/startup/test_startup.py::test_an_unreachable_address_is_reported": 2,
+    "ros1/startup/test_startup.py::test_instance": 2,
+    "ros1/startup/test_startup.py::test_wrong_instance_name": 3,
     "ros1/localizer/test_node.py::test_offline_and_live_agree": 2,
     "processing/test_examples.py::test_an_example": 2,
     "processing/test_process.py::test_results_are_freed_with_their_last_reference": 3,
@@ -213,7 +217,11 @@ def _is_in(path: Path, folders: tuple[str, ...]) -> bool:
 
 
 def pytest_collection_finish() -> None:
-    """Leave the collected tests out of garbage collections, which would examine them again and again."""
+    """Leave the collected tests out of garbage collections, which would examine them again and again.
+
+    Imported modules may have changed variables that decide about forks (`rosafe.ros2` sets the threads of OpenBLAS).
+    """
+    fork_server.restore_environment()
     gc.collect()
     gc.freeze()
 

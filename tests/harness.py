@@ -11,7 +11,9 @@ master process, for tests that kill it. All processes that a test starts end wit
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import inspect
 import itertools
 import os
 import random
@@ -24,8 +26,8 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import AbstractAsyncContextManager, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, TypeVar
@@ -42,7 +44,6 @@ ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = ROOT / "scripts"
 PYTHON = "/usr/bin/python3"
 PATIENCE = 60.0  # s; time limit for any event, also on a busy machine: tests do not check durations
-END_SECONDS = 5.0  # s; within this time a server ends after a request to do so
 GRACE = 20.0  # s; from the request to end until a process is killed
 
 forks = False  # tests/conftest.py sets it: programs are started as forks if possible, except in tests of the start
@@ -130,6 +131,32 @@ def free_port() -> int:
 def can_fork(command: list[str], env: dict[str, str]) -> bool:
     """Return whether a program is started by the server of forks (tests/fork_server.py)."""
     return forks and fork_server.can_fork(command, env, generate.environment()["PYTHONPATH"])
+
+
+def run_program(command: Sequence[str | Path], **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a program to its end, and return its output as text. `options` are those of `subprocess.run`."""
+    usual = {"capture_output": True, "text": True, "timeout": 5 * PATIENCE, "check": False}
+    return subprocess.run(command, **{**usual, **options})
+
+
+def in_loop(context: Callable[..., AbstractAsyncContextManager[Any]], *arguments: Any) -> Callable[[Any], Any]:
+    """Decorate a test that is a coroutine. Its positional-only arguments are what `context(*arguments)` yields."""
+
+    def decorate(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+        async def limited(fixtures: dict[str, Any]) -> None:
+            async with asyncio.timeout(PATIENCE), context(*arguments) as given:
+                await test(*(given if isinstance(given, tuple) else (given,)), **fixtures)
+
+        def run(**fixtures: Any) -> None:
+            asyncio.run(limited(fixtures))
+
+        signature = inspect.signature(test)
+        of_pytest = [one for one in signature.parameters.values() if one.kind is not one.POSITIONAL_ONLY]
+        run.__signature__ = signature.replace(parameters=of_pytest)  # type: ignore[attr-defined]
+        run.__doc__, run.__module__ = test.__doc__, test.__module__
+        return run
+
+    return decorate
 
 
 class Process:

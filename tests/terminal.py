@@ -75,14 +75,14 @@ class Terminal:
         self._raw += more
         return bool(more)
 
-    def press(self, keys: str) -> None:
-        """Press keys."""
+    def press(self, keys: str, until: str = "") -> str:
+        """Press keys, and wait for the text `until`; return the output up to its end."""
         os.write(self._master, keys.encode())
+        return self.expect(until)
 
     def run(self, command: str, prompt: str = "eltclsh > ") -> str:
         """Type a command and Enter; return its output up to the next prompt."""
-        self.press(f"{command}\r")
-        self.expect(command.rpartition("\n")[2])
+        self.press(f"{command}\r", command.rpartition("\n")[2])
         self.expect("\n")
         return self.expect(prompt).removesuffix(prompt).rstrip("\n")
 

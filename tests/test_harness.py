@@ -115,6 +115,14 @@ def test_programs_whose_imports_may_differ_are_not_forked(tmp_path: Path) -> Non
         assert not harness.can_fork(command, {**env, **changes}), (command, changes)
 
 
+def test_variables_that_imported_tests_set_do_not_prevent_forks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    conftest.pytest_collection_finish()
+    assert harness.can_fork(["bass-ros"], Graph("http://127.0.0.1:1", tmp_path).env)
+
+
 def test_the_lists_of_conftest_name_existing_tests() -> None:
     for name in (*conftest.STARTING_FILES, *conftest.LONG_FILES, *conftest.LONGEST_FILES, *conftest.NO_KERNELS):
         assert (ROOT / "tests" / name).exists(), name

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 
 from rosafe.audio.devices import open_source
@@ -206,14 +205,8 @@ def test_safe_names_are_accepted(folder: Path, name: str, opened: str | None) ->
 
 
 def test_pcms_of_the_configuration_can_be_opened_by_plain_name(folder: Path) -> None:
-    """Also PCMs that read or write a file: the configuration is trusted."""
-    samples = np.random.default_rng(5).integers(-(2**31), 2**31, (2, 1000)).astype("<i4")
-    samples.T.tofile(folder / "samples.raw")
-    for name in ("recorded", "plug:recorded"):
-        source = open_source(name, 44100, 500, threading.Event())
-        chunk = source.read()
-        source.close()
-        assert chunk is not None and np.array_equal(chunk.samples, samples[:, :500])
+    """Also those that write a file: the configuration is trusted. tests/audio/test_alsa.py reads one."""
+    (folder / "samples.raw").write_bytes(bytes(8 * 1000))
     source = open_source("logged", 44100, 500, threading.Event())
     assert source.read() is not None
     source.close()

@@ -12,7 +12,7 @@ import soundfile
 
 from rosafe.results.readers import READERS, load
 from tests import fork_server
-from tests.harness import PYTHON, SCRIPTS, Process, can_fork
+from tests.harness import PYTHON, SCRIPTS, Process, can_fork, run_program
 
 ROSAFE = SCRIPTS / "rosafe"
 SMALL = ("--set", "fb_cfHz=200,800,2000")  # a cheap chain, also at low sample rates
@@ -32,16 +32,7 @@ def rosafe(
     command = [str(program), *map(str, arguments)]
     if can_fork(command, environment(**env)):
         return fork_server.shared().run(command, environment(**env), cwd, "", timeout)
-    return subprocess.run(
-        command,
-        cwd=cwd,
-        env=environment(**env),
-        text=True,
-        capture_output=True,
-        stdin=subprocess.DEVNULL,
-        timeout=timeout,
-        check=False,
-    )
+    return run_program(command, cwd=cwd, env=environment(**env), stdin=subprocess.DEVNULL)
 
 
 def rosafe_alone(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -55,8 +55,6 @@ def test_outputs_and_settings(capsys: pytest.CaptureFixture[str]) -> None:
     drnl = run(capsys, "--outputs", "adaptation", "--set", "fb_type=drnl", "adpt_model=adt_breebaart", "--bibtex")
     assert all(key in drnl for key in ("{lopezpoveda2001,", "{jepsen2008,", "{breebaart2001,", "{dau1996,"))
     assert "{hohmann2002," not in drnl
-    ear = run(capsys, "--outputs", "input", "--bibtex")
-    assert "{jepsen2008," not in ear
     conditioned = run(capsys, "--outputs", "preProc", "--set", "pp_bNormalizeRMS=true")
     assert "Tchorz and Kollmeier, 2003" in conditioned
     assert "condition the input (The Two!Ears project, 2018; Tchorz and Kollmeier, 2003)" in " ".join(

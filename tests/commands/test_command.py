@@ -17,7 +17,7 @@ from rosafe.interface import KINDS
 from rosafe.ros1.component import generate
 from rosafe.ros1.transport import master
 from tests.commands.command import ROSAFE, environment, refused, rosafe, rosafe_alone
-from tests.harness import PATIENCE, ROOT
+from tests.harness import ROOT, run_program
 
 
 def test_version() -> None:
@@ -68,14 +68,7 @@ def test_help_of_request_names_every_representation() -> None:
 
 
 def test_help_into_a_closed_pipe() -> None:
-    done = subprocess.run(
-        ["/bin/bash", "-o", "pipefail", "-c", f"{ROSAFE} process -h | true"],
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-    )
+    done = run_program(["/bin/bash", "-o", "pipefail", "-c", f"{ROSAFE} process -h | true"], env=environment())
     assert done.stderr == ""
     assert done.returncode in (0, 141)  # depends on which process is first
 
@@ -109,7 +102,7 @@ def test_a_module_adds_a_command(tmp_path: Path) -> None:
     program = "import sys, rosafe.commands, rosafe.commands.__main__; rosafe.commands.__path__.append(sys.argv.pop(1));"
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
+        return run_program(
             [
                 "/usr/bin/python3",
                 "-c",
@@ -118,10 +111,6 @@ def test_a_module_adds_a_command(tmp_path: Path) -> None:
                 *arguments,
             ],
             env=environment(PYTHONPATH=str(ROOT)),
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE,
-            check=False,
         )
 
     assert "say-hello Say hello to a person" in " ".join(run("-h").stdout.split())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import platform
 import subprocess
@@ -10,9 +11,10 @@ from typing import Any
 
 import pytest
 
+from rosafe.commands import doctor
 from rosafe.ros1.transport import paths
 from tests.commands.command import environment, rosafe, rosafe_alone
-from tests.harness import ROOT, Graph, free_port
+from tests.harness import PYTHON, ROOT, Graph, free_port, run_program
 
 EVERYTHING = ["python", "numbers", "kernels", "plugins", "sound files", "ROS", "messages", "ROS 2", "master", "address"]
 EVERYTHING += ["alsaaudio", "speech", "sound devices", "HTTP server", "Tcl", "plots", "extras"]
@@ -25,16 +27,14 @@ def findings(done: subprocess.CompletedProcess[str]) -> dict[str, dict[str, str]
     return {check["name"]: check for check in report["checks"]}
 
 
-def python(program: str, *options: str, **env: str) -> subprocess.CompletedProcess[str]:
-    """Run a Python program that has the checkout on its path."""
-    return subprocess.run(
-        ["/usr/bin/python3", *options, "-c", program],
-        env=environment(PYTHONPATH=str(ROOT), **env),
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
+def check(name: str, before: str = "", **env: str) -> doctor.Finding:
+    """Return the finding of one check, in a new process that runs `before` first."""
+    program = (
+        f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{before}\nimport json; from rosafe.commands import doctor\n"
+        f"print(json.dumps(doctor.CHECKS[{name!r}]()))"
     )
+    done = run_program([PYTHON, "-c", program], env=environment(**env), check=True)
+    return doctor.Finding(*json.loads(done.stdout))
 
 
 def test_complete_installation() -> None:
@@ -58,9 +58,9 @@ def test_one_line_per_check() -> None:
         assert rest.startswith(name)
 
 
-def test_running_master(graph: Graph) -> None:
-    found = findings(rosafe("doctor", "--json", ROS_MASTER_URI=graph.uri))
-    assert (found["master"]["state"], found["master"]["detail"]) == ("ok", f"answers at {graph.uri}")
+def test_running_master(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_MASTER_URI", graph.uri)
+    assert doctor.CHECKS["master"]()[:2] == (doctor.OK, f"answers at {graph.uri}")
 
 
 @pytest.mark.parametrize(
@@ -73,28 +73,30 @@ def test_running_master(graph: Graph) -> None:
         ("", "", "", ""),
     ],
 )
-def test_unreachable_address(graph: Graph, ip: str, hostname: str, master: str, why: str) -> None:
+def test_unreachable_address(monkeypatch: pytest.MonkeyPatch, ip: str, hostname: str, master: str, why: str) -> None:
     """ROS_HOSTNAME (which takes precedence) or ROS_IP is not of this machine, or not reachable from the master."""
-    done = rosafe("doctor", "--json", ROS_MASTER_URI=master or graph.uri, ROS_IP=ip, ROS_HOSTNAME=hostname)
-    found = findings(done)["address"]
+    address = master or "http://127.0.0.1:11311"
+    for name, value in {"ROS_MASTER_URI": address, "ROS_IP": ip, "ROS_HOSTNAME": hostname}.items():
+        monkeypatch.setenv(name, value)
+    found = doctor.CHECKS["address"]()
     if why:
-        assert (done.returncode, found["state"]) == (1, "MISSING")
-        assert why in found["detail"] and "unset it or set it to " in found["todo"]
+        assert found.state == doctor.MISSING
+        assert why in found.detail and "unset it or set it to " in found.todo
     else:
-        assert found["state"] == "ok" and "is 127.0.0.1" in found["detail"]
+        assert found.state == doctor.OK and "is 127.0.0.1" in found.detail
 
 
 def test_messages_of_this_shell(graph: Graph, tmp_path: Path) -> None:
     """Three environments: after env.sh, without it, and after env.sh of another checkout."""
     paths_of_env = graph.env["PYTHONPATH"]
-    found = findings(rosafe("doctor", "--json", PYTHONPATH=paths_of_env))["messages"]
-    assert found["state"] == "ok" and found["detail"].startswith("up to date")
-    found = findings(rosafe("doctor", "--json"))["messages"]
-    assert found["state"] == "note" and found["todo"] == f". {ROOT}/scripts/env.sh"
+    found = check("messages", PYTHONPATH=paths_of_env)
+    assert found.state == doctor.OK and found.detail.startswith("up to date")
+    found = check("messages")
+    assert found.state == doctor.NOTE and found.todo == f". {ROOT}/scripts/env.sh"
     (tmp_path / "rosAFE" / "msg").mkdir(parents=True)
     (tmp_path / "rosAFE" / "msg" / "__init__.py").touch()
-    found = findings(rosafe("doctor", "--json", PYTHONPATH=f"{tmp_path}:{paths_of_env}"))["messages"]
-    assert found["state"] == "note" and f"this shell uses others, in {tmp_path}" in found["detail"]
+    found = check("messages", PYTHONPATH=f"{tmp_path}:{paths_of_env}")
+    assert found.state == doctor.NOTE and f"this shell uses others, in {tmp_path}" in found.detail
 
 
 def test_empty_installation() -> None:
@@ -119,58 +121,43 @@ def test_empty_installation() -> None:
 
 def test_alsaaudio_of_debian_cannot_capture(tmp_path: Path) -> None:
     (tmp_path / "alsaaudio.py").write_text("PCM_CAPTURE = 1\n")
-    program = (
-        "import pathlib, sys; from rosafe.commands import __main__ as cli; from rosafe.ros1.transport import paths;"
-        f"paths.PYPI_DIR = pathlib.Path({str(tmp_path)!r}); sys.exit(cli.main(['doctor', '--json']))"
-    )
-    done = python(program)
-    assert done.returncode == 1, done
-    found = findings(done)["alsaaudio"]
-    assert found["state"] == "MISSING" and "0.8, which cannot capture" in found["detail"]
-    assert "scripts/install" in found["todo"]
+    before = "import pathlib; from rosafe.ros1.transport import paths"
+    found = check("alsaaudio", f"{before}; paths.PYPI_DIR = pathlib.Path({str(tmp_path)!r})")
+    assert found.state == doctor.MISSING and "0.8, which cannot capture" in found.detail
+    assert "scripts/install" in found.todo
 
 
 def test_plugins(tmp_path: Path) -> None:
     """A valid plugin and a faulty one."""
     page = (ROOT / "docs" / "own-representation.md").read_text("utf-8")
     (tmp_path / "zerocrossings.py").write_text(page.split("```python\n")[1].split("```")[0])
-    found = findings(rosafe("doctor", "--json", ROSAFE_PLUGINS=str(tmp_path)))["plugins"]
-    assert (found["state"], found["detail"]) == ("ok", "zeroCrossings")
+    assert check("plugins", ROSAFE_PLUGINS=str(tmp_path))[:2] == (doctor.OK, "zeroCrossings")
     (tmp_path / "broken.py").write_text("1 / 0\n")
-    found = findings(rosafe("doctor", "--json", ROSAFE_PLUGINS=str(tmp_path)))["plugins"]
-    assert found["state"] == "note" and f"left out: {tmp_path}/broken.py: ZeroDivisionError" in found["detail"]
-    assert "rosafe check" in found["todo"]
+    found = check("plugins", ROSAFE_PLUGINS=str(tmp_path))
+    assert found.state == doctor.NOTE and f"left out: {tmp_path}/broken.py: ZeroDivisionError" in found.detail
+    assert "rosafe check" in found.todo
 
 
 def test_broken_package(tmp_path: Path) -> None:
     (tmp_path / "soundfile.py").write_text("raise OSError('sndfile library\\nnot found')\n")
-    done = rosafe("doctor", "--json", PYTHONPATH=str(tmp_path))
-    assert done.returncode == 1, done
-    found = findings(done)["sound files"]
-    assert found["detail"] == "soundfile (python3-soundfile): sndfile library not found"
+    found = check("sound files", PYTHONPATH=str(tmp_path))
+    assert found[:2] == (doctor.MISSING, "soundfile (python3-soundfile): sndfile library not found")
 
 
-def test_another_python(tmp_path: Path) -> None:
-    program = (
-        "import sys; sys.executable = '/opt/python3.13'; from rosafe.commands import __main__ as cli;"
-        "sys.exit(cli.main(['doctor', '--json']))"
-    )
-    found = findings(python(program))["python"]
-    assert found["state"] == "MISSING" and "/usr/bin/python3" in found["todo"]
+def test_another_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.executable", "/opt/python3.13")
+    found = doctor.CHECKS["python"]()
+    assert found.state == doctor.MISSING and PYTHON in found.todo
 
 
-def test_a_machine_with_ros_2_only() -> None:
+def test_a_machine_with_ros_2_only(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Parts that only ROS 1, sound cards or pictures need are notes, which name the use."""
-    program = """
-import argparse
-from rosafe.commands import doctor
-lost = doctor.Finding(doctor.MISSING, "it is not installed; help", "install it")
-found = doctor.Finding(doctor.OK, "here")
-for name in doctor.CHECKS:
-    doctor.CHECKS[name] = (lambda: lost) if name in ("ROS", "alsaaudio", "plots") else lambda: found
-raise SystemExit(doctor.run(argparse.Namespace(json=True)))
-"""
-    found = findings(python(program))
+    lost = doctor.Finding(doctor.MISSING, "it is not installed; help", "install it")
+    for name in doctor.CHECKS:
+        finding = lost if name in ("ROS", "alsaaudio", "plots") else doctor.Finding(doctor.OK, "here")
+        monkeypatch.setitem(doctor.CHECKS, name, lambda one=finding: one)  # type: ignore[misc]
+    code = doctor.run(argparse.Namespace(json=True))
+    found = findings(subprocess.CompletedProcess([], code, capsys.readouterr().out))
     needed = {
         "ROS": "by nodes of ROS 1 and their clients",
         "alsaaudio": "for sound cards",

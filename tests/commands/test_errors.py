@@ -25,14 +25,6 @@ def assert_untouched(folder: Path, *others: str) -> None:
 # --- the input ---
 
 
-def test_truncated_files(folder: Path) -> None:
-    """tests/audio has the other ones that are refused."""
-    whole = write(folder / "bad.flac", noise(50000)).read_bytes()
-    (folder / "bad.flac").write_bytes(whole[: len(whole) // 2])
-    refused(rosafe("process", "bad.flac", cwd=folder), "bad.flac", "truncated")
-    assert_untouched(folder, "bad.flac")
-
-
 def test_damaged_in_the_middle(folder: Path) -> None:
     """The damage is detected after half of the output was written."""
     content = bytearray(write(folder / "bad.flac", noise(200000)).read_bytes())

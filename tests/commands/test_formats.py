@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from rosafe.system.version import VERSION
 from tests.audio import bags
 from tests.commands.command import SMALL, SMALL_PARAMETERS, as_int32, ild_in, noise, refused, write
 from tests.commands.command import rosafe as command
+from tests.harness import run_program
 
 RATE = 16000
 
@@ -174,9 +174,7 @@ def test_mat_in_octave(tmp_path: Path, sound: Path) -> None:
         f"r = load('{tmp_path}/a.mat'); p = jsondecode(r.parameters);"
         "printf('%s %d %d %d %.17g %g', r.source, size(r.ild), size(r.fb_cfHz, 1), r.ild(2, 5), p.fb_cfHz(3))"
     )
-    done = subprocess.run(
-        ["octave-cli", "--no-init-file", "--eval", program], capture_output=True, text=True, timeout=120, check=False
-    )
+    done = run_program(["octave-cli", "--no-init-file", "--eval", program])
     ild = ild_in(tmp_path / "a.mat")
     assert done.stdout.split() == ["sound.wav", "3", "55", "3", f"{ild[1, 4]:.17g}", "2000"], done
 

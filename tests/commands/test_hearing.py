@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import soundfile
 
 import rosafe
 from tests.commands.command import rosafe as command
-from tests.harness import PYTHON, ROOT
+from tests.harness import PYTHON, ROOT, run_program
 from tests.packaging.test_lint import TOOLS
 
 RATE = 16000
@@ -106,12 +105,5 @@ def test_type_annotations_of_a_users_script(tmp_path: Path) -> None:
     (tmp_path / "installed" / "rosafe").symlink_to(ROOT / "rosafe")
     variables = {**os.environ, "PYTHONPATH": str(TOOLS), "MYPYPATH": str(tmp_path / "installed")}
     ignore = ["--follow-imports=silent", "--ignore-missing-imports"]
-    done = subprocess.run(
-        [PYTHON, "-m", "mypy", "--strict", *ignore, "script.py"],
-        cwd=tmp_path,
-        env=variables,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    done = run_program([PYTHON, "-m", "mypy", "--strict", *ignore, "script.py"], cwd=tmp_path, env=variables)
     assert done.returncode == 0, done.stdout

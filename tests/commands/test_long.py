@@ -14,7 +14,7 @@ import soundfile
 
 from rosafe import load, process
 from tests.commands.command import ROSAFE, environment, noise, rosafe, start, write
-from tests.harness import ROOT, proc, wait_for
+from tests.harness import ROOT, proc, run_program, wait_for
 
 pytestmark = pytest.mark.long
 
@@ -38,13 +38,8 @@ def peak_kilobytes(*arguments: str | Path) -> int:
         "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True);"
         "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
     )
-    done = subprocess.run(
-        ["/usr/bin/python3", "-c", program, str(ROSAFE), *map(str, arguments)],
-        env=environment(),
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=300,
+    done = run_program(
+        ["/usr/bin/python3", "-c", program, str(ROSAFE), *map(str, arguments)], env=environment(), check=True
     )
     return int(done.stdout)
 
@@ -131,9 +126,7 @@ def work(progress):
 
 run_parallel([work], 1, (), lambda index, task: print(task), Interrupts())
 """
-    done = subprocess.run(
-        ["/usr/bin/python3", "-c", program], env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
+    done = run_program(["/usr/bin/python3", "-c", program], env=environment(), cwd=ROOT)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 

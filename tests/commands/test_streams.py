@@ -12,19 +12,11 @@ import pytest
 import rosafe
 from rosafe.audio.files.audiofile import to_int32
 from tests.commands.command import SMALL, environment, noise, write
-from tests.harness import SCRIPTS
+from tests.harness import SCRIPTS, run_program
 
 
 def shell(command: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        ["bash", "-c", f"{SCRIPTS}/{command}"],
-        cwd=cwd,
-        env=environment(),
-        text=True,
-        capture_output=True,
-        timeout=120,
-        check=False,
-    )
+    return run_program(["bash", "-c", f"{SCRIPTS}/{command}"], cwd=cwd, env=environment())
 
 
 CLOSED, FULL = (">&-", "Bad file descriptor"), (">/dev/full", "No space left on device")
@@ -67,14 +59,8 @@ def test_a_current_directory_that_has_been_deleted(tmp_path: Path, command: str)
     write(tmp_path / "in.wav", noise(3000))
     (tmp_path / "gone").mkdir()
     command = command.replace("in.wav", str(tmp_path / "in.wav"))
-    done = subprocess.run(
-        ["bash", "-c", f"rmdir ../gone; exec {SCRIPTS}/rosafe {command}"],
-        cwd=tmp_path / "gone",
-        env=environment(),
-        text=True,
-        capture_output=True,
-        timeout=120,
-        check=False,
+    done = run_program(
+        ["bash", "-c", f"rmdir ../gone; exec {SCRIPTS}/rosafe {command}"], cwd=tmp_path / "gone", env=environment()
     )
     assert done.returncode == 1 and done.stdout == "" and done.stderr.count("\n") == 1
     assert done.stderr.endswith(": the current directory has been deleted; change to another\n")

@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from rosafe.commands import up
 from rosafe.ros1.transport.master import MasterError, check_master
 from rosafe.tree.setups import Setup
 from tests import models
-from tests.harness import ROOT, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
+from tests.harness import ROOT, SCRIPTS, Graph, MasterProcess, Process, free_port, run_program, wait_for
 from tests.terminal import Terminal
 
 SETUP = """
@@ -166,8 +165,7 @@ def test_a_killed_process_is_reported(alone: Graph) -> None:
         done = alone.run("rosnode", "info", "/bass")
         os.kill(int(re.findall(r"Pid: (\d+)", done.stdout)[0]), signal.SIGKILL)
         running.expect("killed by signal 9\n")
-        running.press("\x03")
-        running.expect("ending the processes")
+        running.press("\x03", "ending the processes")
         assert running.end() == 1
         *_, before, last = re.split(r"\x1b\[(?=\d+F)", running.sent)
         lines = before.partition("\x1b[J")[2].replace("\r", "").replace("^C", "").splitlines()
@@ -217,12 +215,9 @@ def test_systemd_accepts_the_units(kind: str, tmp_path: Path) -> None:
         unit.write_text(path.read_text("utf-8").replace("/opt/rosafe/", f"{ROOT}/"))
         units.append(str(unit))
     assert len(units) == 7
-    done = subprocess.run(
+    done = run_program(
         ["systemd-analyze", "verify", "--man=no", *(["--user"] if kind == "user" else []), *units],
         env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
     )
     ours = [line for line in done.stderr.splitlines() if "rosafe" in line]
     assert not ours, done.stderr

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import rosafe
 from tests.commands import forked
 from tests.commands.command import SMALL_PARAMETERS, as_int32, ild_in, noise, write
 from tests.commands.forked import process
-from tests.harness import PYTHON, ROOT
+from tests.harness import PYTHON, ROOT, run_program
 
 EXTENSIONS = [".npz", ".h5", ".mat", ".csv"]
 
@@ -132,13 +131,9 @@ print("ended well")
 
 def filled(tmp_path: Path, how: str, room: Path, before: Sequence[str] = ()) -> None:
     source = write(tmp_path / "in.wav", noise(8000))
-    done = subprocess.run(
+    done = run_program(
         [*before, PYTHON, "-c", _FILLED, str(source), str(room), how, *EXTENSIONS],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
     )
     assert done.returncode == 0 and done.stdout == "ended well\n" and done.stderr == "", done
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import pytest
 
 from rosafe.dsp.kernels import build
-from tests.harness import ROOT, proc
+from tests.harness import ROOT, proc, run_program
 
 from .implementations import levels
 
@@ -73,15 +73,7 @@ class Sanitized(NamedTuple):
             "ROSAFE_TEST_EXAMPLES": str(examples),
         }
         command = [sys.executable, "-m", "tests.dsp.sanitized", str(self.folder), ",".join(map(str, self.levels))]
-        return subprocess.run(
-            [*command, *arguments],
-            cwd=ROOT,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_SECONDS,
-            check=False,
-        )
+        return run_program([*command, *arguments], cwd=ROOT, env=environment)
 
 
 def _runtime(name: str) -> str:

@@ -8,6 +8,9 @@ import pytest
 
 from tests.matlab import octave
 from tests.web.genomix import world as worlds
+from tests.web.genomix.conftest import world
+
+__all__ = ["world"]
 
 
 @pytest.fixture(scope="module")
@@ -16,10 +19,3 @@ def shared_world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[worlds.Wo
     octave.require_program()
     with worlds.world(tmp_path_factory.mktemp("world")) as world:
         yield world
-
-
-@pytest.fixture
-def world(shared_world: worlds.World) -> Iterator[worlds.World]:
-    """Return the nodes of the module, and reset them after the test."""
-    yield shared_world
-    shared_world.reset()

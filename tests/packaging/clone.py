@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.harness import PYTHON, ROOT
+from tests.harness import PYTHON, ROOT, run_program
 
 UNPRIVILEGED_USER = 65534
 CLANG = ROOT / ".generated" / "cached-compilers" / "cached-clang"  # a program, see tests/packaging/conftest.py
@@ -64,14 +64,7 @@ def run(
     *command: str | Path, env: dict[str, str], cwd: Path = Path("/"), seconds: int = 240
 ) -> subprocess.CompletedProcess[str]:
     """Run a command to its end, and return the result for any exit code."""
-    return subprocess.run(
-        ["/usr/bin/timeout", str(seconds), *map(str, command)],
-        env=env,
-        cwd=cwd,
-        text=True,
-        capture_output=True,
-        check=False,
-    )
+    return run_program(["/usr/bin/timeout", str(seconds), *map(str, command)], env=env, cwd=cwd)
 
 
 def without_rights(*command: str | Path) -> list[str | Path]:

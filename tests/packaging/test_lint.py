@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness import PYTHON, ROOT, proc
+from tests.harness import PYTHON, ROOT, proc, run_program
 
 TOOLS = Path("/usr/local/lib/rosafe/tools")  # folder of packages that scripts/install installs from PyPI
 
@@ -16,13 +16,7 @@ TOOLS = Path("/usr/local/lib/rosafe/tools")  # folder of packages that scripts/i
 def tracked() -> list[Path]:
     """Return the files tracked by git, or all files if this is not a clone."""
     if (ROOT / ".git").exists() and shutil.which("git"):
-        listed = subprocess.run(
-            ["git", "-c", f"safe.directory={ROOT}", "ls-files", "-z"],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        listed = run_program(["git", "-c", f"safe.directory={ROOT}", "ls-files", "-z"], cwd=ROOT, check=True)
         paths = [ROOT / name for name in listed.stdout.split("\0") if name]
     else:
         paths = [p for p in ROOT.rglob("*") if not any(part.startswith(".") for part in p.relative_to(ROOT).parts)]

@@ -1,4 +1,4 @@
-"""Limits of size and complexity, names that occur once, plain English, and references to files that exist."""
+"""Limits of size and complexity, names that occur once, and references to files that exist."""
 
 from __future__ import annotations
 
@@ -81,9 +81,6 @@ def test_the_complexity_of_functions_is_limited() -> None:
 def test_each_class_of_a_folder_has_a_name_of_its_own() -> None:
     names = Counter((path.parent, node.name) for path, node in classes())
     assert not [f"{folder.relative_to(ROOT)}: {name}" for (folder, name), count in names.items() if count > 1]
-
-
-# --- plain English ----------------------------------------------------------------------------------------------
 
 
 # --- references -------------------------------------------------------------------------------------------------

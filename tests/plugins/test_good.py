@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import pytest
 
 from tests.harness import wait_for
 from tests.plugins.stages import FRAMED, PLAIN, SAMPLES, Fault, text_of
-from tests.plugins.support import python
+from tests.plugins.support import python, world_with
 from tests.plugins.test_documents import plugins
 from tests.web.genomix import world as worlds
 from tests.web.live.world import live, page
@@ -65,10 +63,7 @@ print(json.dumps({{name: bool(np.allclose(joined[name], result[name]) and result
 def world(folder: Path) -> Iterator[worlds.World]:
     """Return nodes and genomixd in an environment with the plugins and a broken one."""
     (folder / "broken.py").write_text("import nothing_like_this")
-    with mock.patch.dict(os.environ, ROSAFE_PLUGINS=str(folder)), worlds.world(folder.parent) as this:
-        this.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
-        this.http.send("bass/Acquire", ["scene:", 20000, 1000])
-        wait_for(lambda: "/bass/Audio" in this.graph.topics())
+    with world_with(folder) as this:
         yield this
     (folder / "broken.py").unlink()
 

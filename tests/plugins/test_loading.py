@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness import PATIENCE, ROOT
+from tests.harness import ROOT, run_program
 
 from .support import python
 from .test_declarations import GOOD
@@ -27,12 +27,8 @@ def good(kind: str, first: str = "") -> str:
 
 
 def rosafe(*words: str, folder: Path, **env: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [str(ROOT / "scripts" / "rosafe"), *words],
-        env={**os.environ, "ROSAFE_PLUGINS": str(folder), **env},
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
+    return run_program(
+        [str(ROOT / "scripts" / "rosafe"), *words], env={**os.environ, "ROSAFE_PLUGINS": str(folder), **env}
     )
 
 
@@ -61,12 +57,9 @@ def test_output_of_plugins_is_not_evaluated_by_the_shell(tmp_path: Path) -> None
     )
     (tmp_path / "prints.py").write_text(good("prints", first))
     show = "import rosAFE.srv; print(hasattr(rosAFE.srv, 'PrintsProc'))"
-    done = subprocess.run(
+    done = run_program(
         ["bash", "-c", f'. {ROOT}/scripts/env.sh && /usr/bin/python3 -c "{show}"'],
         env={**os.environ, "ROSAFE_PLUGINS": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
     )
     assert done.stdout == "True\n", done
     assert not any(path.exists() for path in touched)

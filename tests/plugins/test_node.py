@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import pytest
 import yaml
@@ -16,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rosafe.web.live.health import Health
 from tests.harness import wait_for
 from tests.plugins.stages import DERIVED, PLAIN, Fault, process, text_of
+from tests.plugins.support import world_with
 from tests.web.genomix import world as worlds
 
 pytestmark = pytest.mark.ros
@@ -70,10 +69,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def world(folder: Path) -> Iterator[worlds.World]:
     """Return nodes with sound of a scene and a tree down to the ratemap."""
-    with mock.patch.dict(os.environ, ROSAFE_PLUGINS=str(folder)), worlds.world(folder.parent) as this:
-        this.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
-        this.http.send("bass/Acquire", ["scene:", 20000, 1000])
-        wait_for(lambda: "/bass/Audio" in this.graph.topics())
+    with world_with(folder) as this:
         wait_for(lambda: started(this))
         yield this
 

@@ -117,16 +117,6 @@ def test_integers_are_normalised_and_floats_are_not() -> None:
     np.testing.assert_array_equal(full_scale["input"], [[-1.0000000004656613], [1.0]])
 
 
-def test_the_misspelling_of_the_guide_is_accepted() -> None:
-    got, wanted = (
-        rosafe.process(
-            SOUND, RATE, parameters={"pp_bMiddleEarFiltering": True, "pp_middleEarModel": word}, outputs=["preProc"]
-        )
-        for word in ("jespen", "jepsen")
-    )
-    assert_same(got, wanted, tolerance=0)
-
-
 @pytest.mark.parametrize("kind", [np.float16, np.float32, np.longdouble])
 def test_other_floats(kind: Any) -> None:
     signal = noise(500).astype(kind)

@@ -14,7 +14,6 @@ from rosafe.representations.moc_reflex import Moc
 from .chain import FloatArray
 
 GIVEN = SignalFormat(16000.0, 100.0, True, 160, 320, (500.0,), "drnl")
-DEFAULTS = {"moc_extIpsi": 1.0, "moc_extContra": 1.0, "moc_thresholdRatedB": -180.0, "moc_maxAttenuationdB": 40.0}
 FACTORS = [Fraction(x) for x in ("-0.00012411", "-0.051322", "-6.3528", "-206.11")]
 
 

@@ -25,7 +25,7 @@ from rosafe.processing.files import process_file
 from rosafe.results import hdf5_reading, isolated, readers
 from rosafe.results.view.plot import draw
 from rosafe.system.output import OutputError
-from tests.harness import PYTHON, ROOT
+from tests.harness import PYTHON, ROOT, run_program
 from tests.results.damage import VALUES, damaged, forked
 
 RATE = 16000
@@ -377,9 +377,7 @@ import os
 try: os.waitpid(-1, os.WNOHANG)
 except ChildProcessError: print("none left")
 """
-    done = subprocess.run(
-        [PYTHON, "-"], input=program, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
-    )
+    done = run_program([PYTHON, "-"], input=program, cwd=tmp_path)
     expected = f"{len(rosafe.load(good / 'a.h5'))}\n"
     assert (done.stdout, done.stderr) == (expected * 2 + "none left\n", "")
     assert not (tmp_path / "marker").exists()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from pathlib import Path
@@ -10,15 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.signal
-import soundfile
 
-import rosafe
 from rosafe.ros1.transport.paths import PYPI_DIR
 from tests.harness import freeze, wait_for
-from tests.localization.conftest import MUSIC, RATE, TALKER, sphere_model, take
+from tests.localization.conftest import MUSIC, TALKER, sphere_model, take
 from tests.localization.sounds import assert_crossed, crossing
-from tests.localization.test_enhancement import si_sdr
+from tests.streams import Part, ids_of_file
 
 from .client import Client
 from .network import Network
@@ -32,6 +28,11 @@ STREAMS = "rosafe_msgs/msg/SourceAudio"
 def seconds(stamp: dict[str, int]) -> float:
     """Return a time of ROS in s."""
     return stamp["sec"] + 1e-9 * stamp["nanosec"]
+
+
+def numbered(message: dict[str, Any]) -> tuple[float, int, list[int]]:
+    """Return stamp, first sample and samples of a message of the streams."""
+    return seconds(message["header"]["stamp"]), message["first_sample"], message["samples"]
 
 
 def play(client: Client, sound: Path) -> list[Any]:
@@ -51,17 +52,6 @@ def rest(client: Client, last: Any) -> list[Any]:
     return parts[1:]
 
 
-def joined(messages: list[Any], id_: int) -> np.ndarray:
-    """Return the samples of a source, whose parts must follow one another, with the times of their numbers."""
-    own = [message for message in messages if message["id"] == id_]
-    for before, after in itertools.pairwise(own):
-        assert after["first_sample"] == before["first_sample"] + len(before["samples"])
-        step = seconds(after["header"]["stamp"]) - seconds(before["header"]["stamp"])
-        assert abs(step - len(before["samples"]) / 16000) < 2e-3
-    assert {(m["sample_rate"], m["header"]["frame_id"]) for m in own} == {(16000, "head")}
-    return np.concatenate([message["samples"] for message in own])
-
-
 def test_streams_are_those_of_the_file(
     ros2: Network, tmp_path: Path, take: tuple[Path, np.ndarray], sphere_model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -74,22 +64,9 @@ def test_streams_are_those_of_the_file(
     parts = play(client, take[0])
     assert node.alive and "Traceback" not in node.err
     monkeypatch.syspath_prepend(str(PYPI_DIR))
-    sound, rate = soundfile.read(take[0])
-    tracks = rosafe.localize(sound, rate, str(sphere_model), streams=True)["tracks"]
-    ids = {}
-    for azimuth, truth in zip((TALKER, MUSIC), take[1], strict=True):
-        id_ = ids[azimuth] = [m["id"] for m in parts if abs(math.degrees(m["azimuth"]) - azimuth) < 8][-1]
-        stream = joined(parts, id_) / 2.0**15
-        offline = next(one for one in tracks if abs(np.median(one["azimuth"]) - azimuth) < 8)
-        expected = offline["stream"] / 2.0**15
-        late = int(scipy.signal.correlate(expected, stream[RATE:], "valid").argmax()) - RATE
-        assert late >= 0, "the localizer found the source in the sound that it had, which begins later"
-        live, same = stream[RATE : len(expected) - late], expected[late:][RATE : len(stream)]
-        assert np.sum((live - same) ** 2) < 0.03 * np.sum(same**2)
-        begin = round(offline["stream_time"] * RATE) + late
-        reference, mixture = (ears[:, begin : begin + len(stream)] for ears in (truth, take[1].sum(axis=0)))
-        heard = np.stack((stream, stream))[:, : reference.shape[1]]
-        assert np.max(si_sdr(heard, reference) - si_sdr(mixture, reference).mean()) > 6
+    assert {(m["sample_rate"], m["header"]["frame_id"]) for m in parts} == {(16000, "head")}
+    of_parts = [Part(m["id"], math.degrees(m["azimuth"]), *numbered(m)) for m in parts]
+    ids = ids_of_file(of_parts, take, sphere_model, undisturbed=False)
     found = [source for message in client.take("sources") for source in message["sources"]]
     talker, music = ([float(one["speech"]) for one in found if one["id"] == ids[at]] for at in (TALKER, MUSIC))
     assert np.isnan(talker[0]), "less than 0.3 s"
@@ -109,8 +86,7 @@ def test_voices_that_cross_keep_their_ids(
     assert client.call("acquire", device=f"file:{tmp_path / 'cross.wav'}")["success"]
     parts = client.take("streams", 1)
     parts += rest(client, parts[-1])
-    of_parts = [(m["id"], seconds(m["header"]["stamp"]), m["first_sample"], m["samples"]) for m in parts]
-    assert_crossed(of_parts, truths)
+    assert_crossed([(m["id"], *numbered(m)) for m in parts], truths)
 
 
 def test_poses_of_sources_that_speak(

@@ -8,23 +8,19 @@ from __future__ import annotations
 
 import os
 import random
-import resource
 import signal
 import socket
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
 
 from rosafe.ros1.bass.socket_client import SocketClient
-from rosafe.ros1.component import serialization
 from tests.harness import PATIENCE, wait_for
-from tests.ros1.afe.attacker import HUGE, FakePublisher, Target, flood, length, publisher_header
+from tests.ros1.afe.attacker import HUGE, Target, length
 from tests.ros1.afe.session import reader
-from tests.soak.world import PEAK_MEMORY, World, following, later
+from tests.soak.world import World, following, later
 
 Address = tuple[str, int]
-TOO_MUCH = 3 * PEAK_MEMORY  # bytes, which the receiver should not accept
 GARBAGE = (
     b"GET / HTTP/1.1\r\n\r\n",
     b"\0",
@@ -77,45 +73,6 @@ def many_connections(world: World, chance: random.Random) -> None:
             stack.enter_context(crowd(world.socket_address, world.size.connections // 10))
             stack.enter_context(crowd(world.http_address, world.size.connections // 3, b"GET /components"))
             world.check_responsive("while they stay")
-
-
-def no_descriptors_left(world: World, chance: random.Random) -> None:
-    """A node that has reached its limit of open files, and many clients that connect."""
-    for target in targets(world):
-        with following(world) as follower, few_files(target.process.pid, 20), ExitStack() as stack:
-            for address in target.ports.values():
-                stack.enter_context(crowd(address, 100, b"\x10"))
-            follower.wait_for_block()
-
-
-@contextmanager
-def few_files(pid: int, more: int) -> Iterator[None]:
-    """Let a process open only `more` files in addition to the open ones."""
-    soft, hard = resource.prlimit(pid, resource.RLIMIT_NOFILE)
-    names = [int(path.name) for path in Path(f"/proc/{pid}/fd").iterdir()]
-    resource.prlimit(pid, resource.RLIMIT_NOFILE, (max(names) + more, hard))
-    try:
-        yield
-    finally:
-        resource.prlimit(pid, resource.RLIMIT_NOFILE, (soft, hard))
-
-
-def a_message_of_4_gib(world: World, chance: random.Random) -> None:
-    """A publisher of Audio and clients of services announce a message of 4 GiB, and send data."""
-    kind = serialization.message_class("bass", "::binaudio::portStruct")
-    sent: list[int] = []
-
-    def lie(sock: socket.socket) -> None:
-        sock.sendall(publisher_header(kind, "/bass/Audio") + length(HUGE))
-        sent.append(flood(sock, bytes(2**20), TOO_MUCH))
-
-    with world.bounded_memory(), FakePublisher(world.graph, "/bass/Audio", kind._type, lie):
-        wait_for(lambda: sent, what="end of the connection")
-    for target in targets(world):
-        with world.bounded_memory(), target.client("Stop") as client:
-            client.sendall(length(HUGE))
-            sent.append(flood(client, bytes(2**20), TOO_MUCH))
-    assert max(sent) < TOO_MUCH, f"data without a limit is accepted: {sent}"
 
 
 def the_master_is_away(world: World, chance: random.Random) -> None:
@@ -188,8 +145,6 @@ def _send_garbage(addresses: list[Address], chance: random.Random, stop: threadi
 ATTACKS = (
     silence_and_browsers,
     many_connections,
-    no_descriptors_left,
-    a_message_of_4_gib,
     the_master_is_away,
     clients_of_the_socket,
     a_mixed_load,

@@ -33,7 +33,6 @@ TREE = {kind: [name] for kind, name in NAMES.items()}
 CHUNKS = 20  # on bass' port, as by default
 DRIFT = 0.15  # s, maximum deviation of bass' frames from the clock: one chunk, and a busy machine
 SLOWER = 3.0  # an answer may take this many times the first one's time, if the machine is busy
-PEAK_MEMORY = 160 * 2**20  # bytes, maximum temporary increase for announced messages
 MORE_MEMORY = 64 * 2**20  # bytes, maximum increase after an attack
 TRIM_SECONDS = 1.1 * state_publisher.TRIM_ROUNDS * state_publisher.DIAGNOSTICS_PERIOD
 MORE_THREADS, MORE_FILES = 8, 16  # likewise: clients that are disconnecting
@@ -268,19 +267,6 @@ class World:
             ]
 
         wait_for(lambda: not more(), what=lambda: f"resources are freed; {more()}")
-
-    @contextmanager
-    def bounded_memory(self) -> Iterator[None]:
-        """Check that no process needs much memory in the meantime."""
-        before = self.use()
-        processes = (self.afe.process, self.bass, self.genomixd)
-        for process in processes:
-            proc(process.pid, "clear_refs").write_text("5")  # reset the peak
-        yield
-        for process, (name, use) in zip(processes, before.items(), strict=True):
-            status = dict(line.split(":", 1) for line in proc(process.pid, "status").read_text().splitlines())
-            peak = int(status["VmHWM"].split()[0]) * 1024
-            assert peak < use.memory + PEAK_MEMORY, f"{name}: {peak / 2**20:.0f} MiB at peak, before {use}"
 
     def bring_master(self) -> None:
         """Start a master at the address of the one that was killed, and wait until all nodes are registered there."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import socket
-import subprocess
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +26,7 @@ from rosafe.system import input as inputs
 from rosafe.system.input import open_descriptor, open_regular, read_regular
 from rosafe.tree.setups import Setup
 from rosafe.tree.setups.state_file import TreeStateFile
-from tests.harness import PYTHON, SCRIPTS, Graph, proc
+from tests.harness import PYTHON, SCRIPTS, Graph, proc, run_program
 
 BY_SUFFIX: dict[str, Callable[[Path], object]] = {
     ".npz": rosafe.load,
@@ -141,13 +140,5 @@ def test_commands(graph: Graph, tmp_path: Path) -> None:
 
 def test_standard_input_can_be_a_pipe(graph: Graph) -> None:
     """The error for invalid content shows that `-` is read from the pipe."""
-    done = subprocess.run(
-        [PYTHON, str(SCRIPTS / "rosafe"), "setup", "load", "-"],
-        input="nothing: here\n",
-        env=graph.env,
-        text=True,
-        capture_output=True,
-        timeout=60,
-        check=False,
-    )
+    done = run_program([PYTHON, str(SCRIPTS / "rosafe"), "setup", "load", "-"], input="nothing: here\n", env=graph.env)
     assert (done.returncode, "unknown 'nothing'" in done.stderr) == (1, True)

@@ -24,14 +24,15 @@ def listener() -> Recorder:
 
 
 @pytest.fixture
-def feed() -> Feed:
-    return Feed()
+def feed(request: pytest.FixtureRequest) -> Feed:
+    """A source with blocks of `FRAMES` of the module, if it has them."""
+    return Feed(**{"frames": request.module.FRAMES} if hasattr(request.module, "FRAMES") else {})
 
 
 @pytest.fixture
-def workers() -> int | None:
-    """Number of workers; None for one on each core."""
-    return None
+def workers(request: pytest.FixtureRequest) -> int | None:
+    """Number of workers: that of a test, or `WORKERS` of its module; None for one on each core."""
+    return getattr(request, "param", getattr(request.module, "WORKERS", None))
 
 
 @pytest.fixture

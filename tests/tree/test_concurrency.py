@@ -20,16 +20,8 @@ from tests.harness import PATIENCE, wait_for
 
 from .support import RATE, Feed, Plain, Recorder, end, use_plain_stages
 
-
-@pytest.fixture
-def feed() -> Feed:
-    return Feed(frames=1)
-
-
-@pytest.fixture
-def workers() -> int:
-    """Enough workers for all concurrent processors, on any machine."""
-    return 4
+FRAMES = 1
+WORKERS = 4  # enough for all concurrent processors, on any machine
 
 
 def test_children_read_the_parents_memory(

@@ -20,11 +20,7 @@ from tests.harness import PATIENCE, wait_for
 from .support import RATE, Feed, Recorder, grow
 from .test_changes import LEAVES, NOISE, assert_as, chain, settle
 
-
-@pytest.fixture
-def workers() -> int:
-    """Enough workers for a parent to compute its next block while a child is blocked."""
-    return 2
+WORKERS = 2  # enough for a parent to compute its next block while a child is blocked
 
 
 @pytest.fixture
@@ -113,10 +109,9 @@ def test_a_live_switch_to_the_envelope_and_back_loses_no_block(
         assert_as(listener, tree, kind, outputs)
 
 
-def test_a_released_block_without_the_envelope_is_processed_by_the_old_method(
-    tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The filterbank has already computed the next block when the method changes."""
+@pytest.fixture
+def held(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
+    """Let the hair cell wait with its first block for the second event; the first one is set then."""
     working, go_on = threading.Event(), threading.Event()
     original = InnerHairCell.process
 
@@ -126,6 +121,14 @@ def test_a_released_block_without_the_envelope_is_processed_by_the_old_method(
         return original(self, block, *envelope)
 
     monkeypatch.setattr(InnerHairCell, "process", process)
+    return working, go_on
+
+
+def test_a_released_block_without_the_envelope_is_processed_by_the_old_method(
+    tree: Tree, feed: Feed, listener: Recorder, held: tuple[threading.Event, threading.Event]
+) -> None:
+    """The filterbank has already computed the next block when the method changes."""
+    working, go_on = held
     grow(tree, feed)
     filterbank, ihc = tree.find("gammatone"), tree.find("ihc")
     feed.put(*NOISE[:2])
@@ -139,20 +142,10 @@ def test_a_released_block_without_the_envelope_is_processed_by_the_old_method(
 
 
 def test_a_block_without_the_envelope_is_not_lost(
-    tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
+    tree: Tree, feed: Feed, listener: Recorder, held: tuple[threading.Event, threading.Event]
 ) -> None:
     """The filterbank has computed it for a method that is changed again."""
-    working, go_on = threading.Event(), threading.Event()
-    original = InnerHairCell.process
-
-    def process(self: InnerHairCell, block: np.ndarray, *envelope: np.ndarray) -> np.ndarray:
-        if block[0, 0, 0] == first[0, 0, 0]:
-            working.set()
-            assert go_on.wait(PATIENCE)
-        return original(self, block, *envelope)
-
-    first = chain().blocks([NOISE[0]])[0]["gammatone"]
-    monkeypatch.setattr(InnerHairCell, "process", process)
+    working, go_on = held
     grow(tree, feed)
     filterbank, ihc = tree.find("gammatone"), tree.find("ihc")
     tree.modify("ihc", "ihc_method", "hilbert")

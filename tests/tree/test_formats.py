@@ -121,14 +121,7 @@ def stages(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(STAGES, kind, stage)
 
 
-@pytest.fixture
-def feed() -> Feed:
-    return Feed(frames=8)
-
-
-@pytest.fixture
-def workers() -> int:
-    return 2
+FRAMES, WORKERS = 8, 2
 
 
 def grow(tree: Tree, feed: Feed, **parameters: Any) -> None:

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.long
 WALKS = 300
 
 Check = Callable[[], None]
-Scenario = Callable[[Scheduler, int], Check]
+Scenario = Callable[..., Check]
 
 
 class Numbers:
@@ -91,6 +91,11 @@ class Log:
         if last is not None:
             assert numbers[-1:] == [last], f"{processor!r} released {numbers}"
 
+    def assert_runs(self, *runs: tuple[Processor, int | None, int | None]) -> None:
+        """Check several processors."""
+        for run in runs:
+            self.assert_run(*run)
+
 
 def use(patch: pytest.MonkeyPatch, threading: Any) -> None:
     """Let the code of the tree use the locks and threads of `threading`."""
@@ -114,33 +119,24 @@ def end(tree: Tree) -> None:
 # --- scenarios ---
 
 
-def grow(scheduler: Scheduler, count: int) -> Check:
+def grow(scheduler: Scheduler, log: Log, tree: Tree) -> Check:
     """Processors are added while blocks are processed: siblings, and a grandchild."""
-    log = Log()
-    tree = Tree(log, count)
     root = tree.add_input("input", Numbers(range(3)), 1, 0.0, 0.0)
     first = tree.add("preProc", "first", "input")
     below = tree.add("gammatone", "below", "first")
     second = tree.add("preProc", "second", "input")
     run_to_the_end(tree)
 
-    def check() -> None:
-        log.assert_run(root, 0, 2)
-        for one in (first, below, second):
-            log.assert_run(one, None, 2)
-
-    return check
+    return partial(log.assert_runs, (root, 0, 2), *((one, None, 2) for one in (first, below, second)))
 
 
-def receive(scheduler: Scheduler, count: int) -> Check:
+def receive(scheduler: Scheduler, log: Log, tree: Tree) -> Check:
     """As `wake`, in real time: the thread that adds blocks runs tasks itself if all workers are idle."""
-    return wake(scheduler, count, real_time=True)
+    return wake(scheduler, log, tree)
 
 
-def receive_until_stop(scheduler: Scheduler, count: int) -> Check:
+def receive_until_stop(scheduler: Scheduler, log: Log, tree: Tree) -> Check:
     """The tree is stopped while the thread that adds blocks runs its tasks."""
-    log = Log()
-    tree = Tree(log, count, real_time=True)
     source = Numbers(range(0), ends=False)
     root = tree.add_input("input", source, 1, 0.0, 0.0)
     child = tree.add("preProc", "child", "input")
@@ -163,10 +159,8 @@ def receive_until_stop(scheduler: Scheduler, count: int) -> Check:
     return check
 
 
-def wake(scheduler: Scheduler, count: int, real_time: bool = False) -> Check:
+def wake(scheduler: Scheduler, log: Log, tree: Tree) -> Check:
     """A thread adds blocks one by one, and wakes the tree each time."""
-    log = Log()
-    tree = Tree(log, count, real_time)
     source = Numbers(range(0), ends=False)
     root = tree.add_input("input", source, 1, 0.0, 0.0)
     child = tree.add("preProc", "child", "input")
@@ -183,16 +177,11 @@ def wake(scheduler: Scheduler, count: int, real_time: bool = False) -> Check:
     player.join()
     run_to_the_end(tree)
 
-    def check() -> None:
-        log.assert_run(root, 0, 2)
-        log.assert_run(child, 0, 2)
-
-    return check
+    return partial(log.assert_runs, (root, 0, 2), (child, 0, 2))
 
 
-def require(scheduler: Scheduler, count: int) -> Check:
+def require(scheduler: Scheduler, log: Log, tree: Tree) -> Check:
     """A source asks which frame is required while blocks are on their way. Two of them complete an awaited output."""
-    tree = Tree(Log(), count, real_time=True)
     source = Numbers(range(0), ends=False)
     tree.add_input("input", source, 1, 0.0, 0.0).awaited = False
     tree.add("preProc", "between", "input").awaited = False
@@ -218,10 +207,8 @@ def require(scheduler: Scheduler, count: int) -> Check:
     return check
 
 
-def without_consumers(scheduler: Scheduler, count: int) -> Check:
+def without_consumers(scheduler: Scheduler, log: Log, tree: Tree) -> Check:
     """The input and its child have no consumers. The grandchild gets all blocks."""
-    log = Log()
-    tree = Tree(log, count)
     source = Numbers(range(0), ends=False)
     root = tree.add_input("input", source, 1, 0.0, 0.0)
     middle = tree.add("preProc", "middle", "input")
@@ -240,10 +227,8 @@ def without_consumers(scheduler: Scheduler, count: int) -> Check:
     return check
 
 
-def shrink(scheduler: Scheduler, count: int) -> Check:
+def shrink(scheduler: Scheduler, log: Log, tree: Tree) -> Check:
     """One of two siblings is removed with its child, and its name is used again immediately."""
-    log = Log()
-    tree = Tree(log, count)
     root = tree.add_input("input", Numbers(range(2)), 1, 0.0, 0.0)
     staying = tree.add("preProc", "staying", "input")
     going = tree.add("preProc", "going", "input")
@@ -265,10 +250,8 @@ def shrink(scheduler: Scheduler, count: int) -> Check:
     return check
 
 
-def remove_child(scheduler: Scheduler, count: int) -> Check:
+def remove_child(scheduler: Scheduler, log: Log, tree: Tree) -> Check:
     """The only child is removed: the input does not wait for it."""
-    log = Log()
-    tree = Tree(log, count)
     root = tree.add_input("input", Numbers(range(3)), 1, 0.0, 0.0)
     child = tree.add("preProc", "child", "input")
     tree.remove("child")
@@ -282,10 +265,8 @@ def remove_child(scheduler: Scheduler, count: int) -> Check:
     return check
 
 
-def replace_input(scheduler: Scheduler, count: int) -> Check:
+def replace_input(scheduler: Scheduler, log: Log, tree: Tree) -> Check:
     """A new input takes over the tree. Its child gets all its blocks, whatever it did for the old one."""
-    log = Log()
-    tree = Tree(log, count)
     old_source, new_source = Numbers(range(2), ends=False), Numbers(range(10, 13))
     old = tree.add_input("input", old_source, 1, 0.0, 0.0)
     child = tree.add("preProc", "child", "input")
@@ -308,10 +289,8 @@ def replace_input(scheduler: Scheduler, count: int) -> Check:
     return check
 
 
-def stop(scheduler: Scheduler, count: int) -> Check:
+def stop(scheduler: Scheduler, log: Log, tree: Tree) -> Check:
     """The tree is stopped at any moment and built again."""
-    log = Log()
-    tree = Tree(log, count)
     tree.add_input("input", Numbers(range(9), ends=False), 1, 0.0, 0.0)
     tree.add("preProc", "child", "input")
     tree.stop()
@@ -327,10 +306,8 @@ def stop(scheduler: Scheduler, count: int) -> Check:
     return check
 
 
-def fail(scheduler: Scheduler, count: int) -> Check:
+def fail(scheduler: Scheduler, log: Log, tree: Tree) -> Check:
     """A processor fails in its second block. Its sibling and its parent are not affected."""
-    log = Log()
-    tree = Tree(log, count)
     root = tree.add_input("input", Numbers(range(2)), 1, 0.0, 0.0)
     staying = tree.add("preProc", "staying", "input")
     going = tree.add("preProc", "going", "input", {"fails": True})
@@ -379,7 +356,8 @@ def plain_stages(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def go(patch: pytest.MonkeyPatch, scenario: Scenario, count: int, delays: int, walks: int) -> int:
     def run(scheduler: Scheduler) -> Check:
-        return scenario(scheduler, count)
+        log = Log()
+        return scenario(scheduler, log, Tree(log, count, real_time=scenario in (receive, receive_until_stop, require)))
 
     return explore(run, partial(use, patch), delays, walks)
 

@@ -15,15 +15,7 @@ from tests.harness import PATIENCE
 
 from .support import Feed, Plain, Recorder, use_plain_stages
 
-
-@pytest.fixture
-def feed() -> Feed:
-    return Feed(frames=1)
-
-
-@pytest.fixture
-def workers() -> int:
-    return 3
+FRAMES, WORKERS = 1, 3
 
 
 def test_overlap_of_parent_and_child_and_of_siblings(

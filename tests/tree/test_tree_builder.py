@@ -362,11 +362,6 @@ def test_a_plugin_that_fails_with_its_first_block(client: Client, monkeypatch: p
     assert list(client.state()) == others[0].dependencies
 
 
-def test_words_that_the_guide_misspells(client: Client) -> None:
-    assert client.build("time", pp_middleEarModel="jespen").created == ["input_0", "time_0"]
-    assert client.build("time").created == []
-
-
 def test_a_long_window_costs_nothing() -> None:
     """The node creates or rejects it."""
     tracemalloc.start()

@@ -22,15 +22,7 @@ from tests.harness import PATIENCE, wait_for
 
 from .support import Feed, Plain, Recorder, tree_threads, use_plain_stages
 
-
-@pytest.fixture
-def feed() -> Feed:
-    return Feed(frames=1)
-
-
-@pytest.fixture
-def workers(request: pytest.FixtureRequest) -> int:
-    return int(getattr(request, "param", 1))
+FRAMES, WORKERS = 1, 1
 
 
 def computing() -> int:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests import harness
+from tests.harness import run_program
 from tests.terminal import Terminal
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
@@ -38,14 +39,11 @@ def run(home: Path, tmp_path: Path) -> Run:
         *arguments: str, shell: str = "eltclsh", stdin: str = "", **env: str
     ) -> subprocess.CompletedProcess[str]:
         program = shell if shell == "tclsh" else str(harness.SCRIPTS / shell)
-        return subprocess.run(
+        return run_program(
             ["timeout", "-k", "2", str(harness.PATIENCE), program, *arguments],
             env={**environment(home), **env},
             cwd=tmp_path,
             input=stdin,
-            capture_output=True,
-            text=True,
-            check=False,
         )
 
     return run_shell

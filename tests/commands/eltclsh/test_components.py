@@ -58,14 +58,12 @@ def test_the_guide_typed_at_the_prompt(guide: Terminal) -> None:
 def test_a_callback_runs_while_the_prompt_waits(guide: Terminal) -> None:
     guide.run("package require genomix; [genomix::connect] load bass")
     guide.run('proc report {request} {puts "[$request status]: [catch {$request result} e] [dict get $e ex]"}')
-    guide.press("bass::Acquire {device none} & report\r")
-    guide.expect("error: 1 ::bass::e_device\n")
+    guide.press("bass::Acquire {device none} & report\r", "error: 1 ::bass::e_device\n")
 
 
 def test_an_error_in_the_background_is_printed_once(guide: Terminal) -> None:
     guide.run("package require genomix; set g [genomix::connect]; $g load rosAFE; $g load bass")
-    guide.press("rosAFE::modifyParameter {nameProc missing nameParam x newValue 1} &\r")
-    guide.expect("\n::genomix::request1\n")
+    guide.press("rosAFE::modifyParameter {nameProc missing nameParam x newValue 1} &\r", "\n::genomix::request1\n")
     guide.expect(
         "rosAFE::modifyParameter &: ::rosAFE::e_noSuchProcessor: there is no processor 'missing'; there are: none\n"
     )
@@ -82,17 +80,12 @@ def test_an_error_in_the_background_is_printed_once(guide: Terminal) -> None:
 
 def test_missing_parameters_are_asked_for(guide: Terminal) -> None:
     guide.run("package require genomix; set g [genomix::connect]; $g load bass; $g load rosAFE")
-    guide.press("rosAFE::connect_port\r")
-    guide.expect("\nstring local: Name of this component's input port > ")
-    guide.press("\r")
-    guide.expect("local has no default\n")
+    guide.press("rosAFE::connect_port\r", "\nstring local: Name of this component's input port > ")
+    guide.press("\r", "local has no default\n")
     guide.expect("string local: ")
-    guide.press("Audio\r")
-    guide.expect("string remote: ")
-    guide.press("bass/Audio\r")
-    guide.expect("eltclsh > ")
-    guide.press("bass::Acquire &\r")
-    question = guide.expect("(hw:1,0) > ")
+    guide.press("Audio\r", "string remote: ")
+    guide.press("bass/Audio\r", "eltclsh > ")
+    question = guide.press("bass::Acquire &\r", "(hw:1,0) > ")
     assert "\nstring device: " in question
     guide.press("scene:\r")
     for name, answer in (("sampleRate", "22050"), ("nFramesPerChunk", ""), ("nChunksOnPort", "")):
@@ -117,11 +110,9 @@ def test_missing_parameters_are_asked_for(guide: Terminal) -> None:
     guide.expect("\nstring representation: The representation, such as ild > ")
     guide.press("ihc\r")
     assert "\nname ihc dependencies {0 input 1 preProc 2 gammatone 3 ihc} created {} " in guide.expect("eltclsh > ")
-    guide.press("rosAFE::IldProc\r")
-    guide.expect("string name: ")
+    guide.press("rosAFE::IldProc\r", "string name: ")
     guide.expect(") > ")
-    guide.press("\x04")
-    assert "no input" in guide.expect("eltclsh > ")
+    assert "no input" in guide.press("\x04", "eltclsh > ")
     assert guide.run("dict size [dict get [rosAFE::getParameters] parameters ild]") == "0"
 
 
@@ -142,13 +133,10 @@ def test_tab_completes_the_parameters_of_components(guide: Terminal) -> None:
         ("rosAFE::request {rep\t", "{representation "),
         ("$g unl\t", "$g unload "),
     ):
-        guide.press(typed)
-        guide.expect(completed)
+        guide.press(typed, completed)
         guide.press("\x15")
-    guide.press("rosAFE::IhcProc \t\t")
-    output = guide.expect("rosAFE::IhcProc {")
+    output = guide.press("rosAFE::IhcProc \t\t", "rosAFE::IhcProc {")
     output += guide.expect("rosAFE::IhcProc {")
     assert "name" in output and "upperDepName" in output and "ihc_method" in output
-    guide.press("\x15rosAFE::IhcProc {name a \r upp\t")
-    guide.expect("upperDepName ")
+    guide.press("\x15rosAFE::IhcProc {name a \r upp\t", "upperDepName ")
     guide.press("\x15}\r")

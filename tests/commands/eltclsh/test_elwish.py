@@ -48,8 +48,7 @@ def test_window_events_are_processed_while_the_prompt_waits(home: Path, display:
     with Terminal([str(harness.SCRIPTS / "elwish")], env) as terminal:
         terminal.expect("elwish > ")
         terminal.run("bind . <Destroy> {puts gone}", "elwish > ")
-        terminal.press("bind . <Map> {puts mapped; after 1 {destroy .}}; wm deiconify .\r")
-        terminal.expect("mapped\n")
+        terminal.press("bind . <Map> {puts mapped; after 1 {destroy .}}; wm deiconify .\r", "mapped\n")
         terminal.expect("gone\n")
         terminal.press("exit 5\r")
         assert terminal.end() == 5

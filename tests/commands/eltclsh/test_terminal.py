@@ -30,16 +30,13 @@ def test_banner_prompt_results_and_errors(home: Path) -> None:
 
 
 def test_commands_of_several_lines(terminal: Terminal) -> None:
-    terminal.press("proc f {} {\r")
-    terminal.expect("\n: ")
-    terminal.press("  return 5\r")
-    terminal.expect("\n: ")
+    terminal.press("proc f {} {\r", "\n: ")
+    terminal.press("  return 5\r", "\n: ")
     terminal.run("}")
     assert terminal.run("f") == "5"
     terminal.press("\x1b[A\x1b[A")  # the arrow key recalls all its lines
     terminal.expect("return 5")
-    terminal.press("\x05\r")
-    terminal.expect("eltclsh > ")
+    terminal.press("\x05\r", "eltclsh > ")
     terminal.press(PASTE.format("set a 1\nset b [expr {\n1 + 1}]\nset c 3"))
     assert terminal.expect("3\neltclsh > ").endswith("1\n2\n3\neltclsh > ")
 
@@ -49,8 +46,7 @@ def test_prompts_of_the_user(terminal: Terminal) -> None:
     terminal.run("set n 6; proc count {} {return [incr ::n]>}; set el::prompt1 count", "7>")
     terminal.run("list", "8>")
     terminal.run("proc el::prompt2 {} {return {more: }}", "9>")
-    terminal.press("list {\r")
-    terminal.expect("more: ")
+    terminal.press("list {\r", "more: ")
     terminal.run("}", "10>")
     terminal.run("set el::prompt1 {error bad}", "bad\neltclsh > ")
 
@@ -58,23 +54,17 @@ def test_prompts_of_the_user(terminal: Terminal) -> None:
 def test_events_are_served_while_the_prompt_waits(terminal: Terminal) -> None:
     terminal.run("set pipe [open {|sh -c {read x; echo got $x}} r+]; fconfigure $pipe -buffering line")
     terminal.run("fileevent $pipe readable {puts [gets $pipe]; close $pipe}")
-    terminal.press("set half")
-    terminal.expect("set half")
-    terminal.press("\x15puts $pipe it\r")
-    terminal.expect("got it")
-    terminal.press("\r")
-    terminal.expect("eltclsh > ")
+    terminal.press("set half", "set half")
+    terminal.press("\x15puts $pipe it\r", "got it")
+    terminal.press("\r", "eltclsh > ")
     # A question interrupts the line that is being typed, which is continued afterwards.
     terminal.run("set pipe [open {|sh -c {read x; echo $x}} r+]; fconfigure $pipe -buffering line")
     terminal.run("fileevent $pipe readable {gets $pipe name; close $pipe; set answer [el::gets $name]}")
     terminal.run("after 300 {puts $pipe sure?}")
-    terminal.press("set ha")
-    terminal.expect("set ha")
+    terminal.press("set ha", "set ha")
     terminal.expect("\nsure?")
-    terminal.press("of course\r")
-    terminal.expect("eltclsh > set ha")
-    terminal.press("lf 5\r")
-    terminal.expect("5\neltclsh > ")
+    terminal.press("of course\r", "eltclsh > set ha")
+    terminal.press("lf 5\r", "5\neltclsh > ")
     assert terminal.run("list $answer $half") == "{of course} 5"
     terminal.press("after 1 {exit 6}\r")
     assert terminal.end() == 6
@@ -92,10 +82,8 @@ def test_the_history_is_saved_between_sessions(home: Path) -> None:
         terminal.run("el::history add {set new 1}")
         assert terminal.run("el::history event") == "set new 1"
         terminal.run("el::history change {set new 2}")
-        terminal.press("\x1b[A")
-        terminal.expect("set new 2")
-        terminal.press("\r")
-        terminal.expect("2\neltclsh > ")
+        terminal.press("\x1b[A", "set new 2")
+        terminal.press("\r", "2\neltclsh > ")
         terminal.press("\x04")
         assert terminal.end() == 0
     assert (home / ".eltclhistory").stat().st_mode & 0o777 == 0o600
@@ -111,59 +99,40 @@ def test_the_history_is_saved_between_sessions(home: Path) -> None:
         terminal.run("el::history file /dev/null")
         assert terminal.run("el::history save") == "/dev/null: /dev/null is not a regular file"
         terminal.run("el::history file /absent/file")
-        terminal.press("exit\r")
-        assert "the history is not saved" in terminal.expect("/absent/file'")
+        assert "the history is not saved" in terminal.press("exit\r", "/absent/file'")
         assert terminal.end() == 0
 
 
 def test_ctrl_c_while_a_command_runs(terminal: Terminal) -> None:
     for busy in ("after 1", "catch {vwait forever}"):
         terminal.run("set n 0")
-        terminal.press(f"while 1 {{if {{[incr n] == 1}} {{puts be[list gun]}}; {busy}}}\r")
-        terminal.expect("begun\n")
-        terminal.press("\x03")
-        terminal.expect(QUESTION)
+        terminal.press(f"while 1 {{if {{[incr n] == 1}} {{puts be[list gun]}}; {busy}}}\r", "begun\n")
+        terminal.press("\x03", QUESTION)
         terminal.press("x1")  # continues
         terminal.expect("> 1\n")
-        terminal.press("\x03")
-        terminal.expect(QUESTION)
-        terminal.press("3")
-        terminal.expect("eltclsh > ")
+        terminal.press("\x03", QUESTION)
+        terminal.press("3", "eltclsh > ")
         assert int(terminal.run("set n")) > 0
-    terminal.press("exec sh -c {echo begun >/dev/tty; exec sleep 60}\r")
-    terminal.expect("begun\n")
-    terminal.press("\x03")
-    terminal.expect(QUESTION)
+    terminal.press("exec sh -c {echo begun >/dev/tty; exec sleep 60}\r", "begun\n")
+    terminal.press("\x03", QUESTION)
     terminal.press("2")
     assert terminal.end() == 0
 
 
 def test_ctrl_c_at_the_prompt(terminal: Terminal) -> None:
-    terminal.press("set kept")
-    terminal.expect("set kept")
-    terminal.press("\x03")
-    terminal.expect(QUESTION)
-    terminal.press("1")
-    terminal.expect("eltclsh > set kept")
-    terminal.press(" 7\r")
-    terminal.expect("7\neltclsh > ")
-    terminal.press("proc gone {} {\r")
-    terminal.expect("\n: ")
-    terminal.press("half")
-    terminal.expect("half")
-    terminal.press("\x03")
-    terminal.expect(QUESTION)
-    terminal.press("\x03")
-    terminal.expect("eltclsh > ")
+    terminal.press("set kept", "set kept")
+    terminal.press("\x03", QUESTION)
+    terminal.press("1", "eltclsh > set kept")
+    terminal.press(" 7\r", "7\neltclsh > ")
+    terminal.press("proc gone {} {\r", "\n: ")
+    terminal.press("half", "half")
+    terminal.press("\x03", QUESTION)
+    terminal.press("\x03", "eltclsh > ")
     assert terminal.run("info commands gone") == ""
-    terminal.press("el::gets {name? }\r")
-    terminal.expect("\nname? ")
-    terminal.press("\x03")
-    terminal.expect(QUESTION)
-    terminal.press("3")
-    assert terminal.expect("eltclsh > ") == "3\ninterrupted\neltclsh > "
-    terminal.press("\x03")
-    terminal.expect(QUESTION)
+    terminal.press("el::gets {name? }\r", "\nname? ")
+    terminal.press("\x03", QUESTION)
+    assert terminal.press("3", "eltclsh > ") == "3\ninterrupted\neltclsh > "
+    terminal.press("\x03", QUESTION)
     terminal.press("2")
     assert terminal.end() == 0
 
@@ -171,35 +140,23 @@ def test_ctrl_c_at_the_prompt(terminal: Terminal) -> None:
 def test_signals_of_the_user(terminal: Terminal) -> None:
     assert terminal.run("signal INT") == "::el::interrupted"
     terminal.run("signal INT {puts mine}")
-    terminal.press("\x03")
-    terminal.expect("mine\n")
+    terminal.press("\x03", "mine\n")
     terminal.run("signal USR1 {puts user; error bad}")
-    terminal.press("exec kill -USR1 [pid]\r")
-    terminal.expect("user\n")
+    terminal.press("exec kill -USR1 [pid]\r", "user\n")
     terminal.expect("bad\n")
 
 
 def test_answers_for_the_procedures_of_the_original(terminal: Terminal) -> None:
-    terminal.press("aska int number 4\r")
-    terminal.expect("number [4]> ")
-    terminal.press("x\r")
-    assert "expecting integer but got x\n" in terminal.expect("number [4]> ")
-    terminal.press("2 * 3\r")
-    assert terminal.expect("eltclsh > ").splitlines()[-2] == "6"
-    terminal.press("aska {red green} colour green\r")
-    terminal.expect("colour [green]> ")
-    terminal.press("r\t")
-    terminal.expect("red ")
-    terminal.press("\r")
-    assert "\nred\n" in terminal.expect("eltclsh > ")
-    terminal.press("el::getc\r")
-    terminal.expect("getc\n")
-    terminal.press("é")
-    assert terminal.expect("eltclsh > ").endswith("é\neltclsh > ")
-    terminal.press("el::gets {end? }\r")
-    terminal.expect("\nend? ")
-    terminal.press("\x04")
-    assert "no input" in terminal.expect("eltclsh > ")
+    terminal.press("aska int number 4\r", "number [4]> ")
+    assert "expecting integer but got x\n" in terminal.press("x\r", "number [4]> ")
+    assert terminal.press("2 * 3\r", "eltclsh > ").splitlines()[-2] == "6"
+    terminal.press("aska {red green} colour green\r", "colour [green]> ")
+    terminal.press("r\t", "red ")
+    assert "\nred\n" in terminal.press("\r", "eltclsh > ")
+    terminal.press("el::getc\r", "getc\n")
+    assert terminal.press("é", "eltclsh > ").endswith("é\neltclsh > ")
+    terminal.press("el::gets {end? }\r", "\nend? ")
+    assert "no input" in terminal.press("\x04", "eltclsh > ")
 
 
 def test_tab_completes(terminal: Terminal, home: Path) -> None:
@@ -225,35 +182,28 @@ def test_tab_completes(terminal: Terminal, home: Path) -> None:
         ("signal US\t", "signal USR"),
         ("flush std\te\t", "flush stderr "),
     ):
-        terminal.press(typed)
-        terminal.expect(completed)
+        terminal.press(typed, completed)
         terminal.press("\x15")
-    terminal.press("lre\t")
-    shown = terminal.expect("eltclsh > lre")
+    shown = terminal.press("lre\t", "eltclsh > lre")
     assert "lrepeat" in shown and "lreplace" in shown and "lreverse" in shown
     terminal.press("\x15")
     terminal.run("set el::queryItems 2; lappend el::completionPatterns {^mine$ {p 1 {alpha beta}} {n ^alpha$ d}}; list")
-    terminal.press("lre\t")
-    terminal.expect("Display all 3 possibilities? (y or n)")
-    terminal.press("n\x15mine al\t")
-    terminal.expect("mine alpha ")
+    terminal.press("lre\t", "Display all 3 possibilities? (y or n)")
+    terminal.press("n\x15mine al\t", "mine alpha ")
     terminal.press("\x15")
     terminal.run("lappend el::completionPatterns {^part$ {C , {first second}}}; list")  # after the last match
-    terminal.press("part first,x,se\t")
-    terminal.expect("part first,x,second ")
+    terminal.press("part first,x,se\t", "part first,x,second ")
 
 
 def test_the_terminal_is_restored(home: Path) -> None:
     with Terminal(["/bin/sh"], {**environment(home), "PS1": "sh$ "}) as terminal:
         terminal.expect("sh$ ")
         before = terminal.run("stty -a", "sh$ ")
-        terminal.press(f"{ELTCLSH}\r")
-        terminal.expect("eltclsh > ")
+        terminal.press(f"{ELTCLSH}\r", "eltclsh > ")
         terminal.run("exit 3", "sh$ ")
         assert terminal.run("echo $?", "sh$ ") == "3"
         assert terminal.run("stty -a", "sh$ ") == before
-        terminal.press(f"{ELTCLSH}\r")
-        terminal.expect("eltclsh > ")
+        terminal.press(f"{ELTCLSH}\r", "eltclsh > ")
         terminal.run("close stdin", "sh$ ")
 
 
@@ -263,6 +213,5 @@ def test_a_script_can_start_the_prompt(home: Path, tmp_path: Path) -> None:
     with Terminal([ELTCLSH, str(script)], environment(home)) as terminal:
         assert terminal.expect("eltclsh > ").startswith("0\n")
         assert terminal.run("list [incr mine] $tcl_interactive") == "2 1"
-        terminal.press("\x04")
-        terminal.expect("after\n")
+        terminal.press("\x04", "after\n")
         assert terminal.end() == 2

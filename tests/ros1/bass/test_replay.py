@@ -1,4 +1,4 @@
-"""A recording by `rosbag record` reproduces the representations of the live run, by `rosbag play` and by bass."""
+"""A recording by `rosbag record` reproduces the representations of the live run, by `rosbag play`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import rosgraph
 import soundfile
 
 from rosafe.interface import CORE_REPRESENTATIONS
-from rosafe.ros1.component import serialization
 from tests.audio import bags
 from tests.harness import Graph, Process, wait_for
 from tests.ros1.afe.session import RATE, Session, assert_holds, expected, noise, own_node, windowed
@@ -50,12 +49,6 @@ def assert_same(node: Session, recorded: Recorded) -> None:
 def acquire(graph: Graph, device: str) -> None:
     answer = graph.call("/bass/Acquire", device=device, sampleRate=RATE, nFramesPerChunk=CHUNK, nChunksOnPort=CHUNKS)
     assert answer.genom_success
-
-
-@pytest.fixture(scope="module")
-def bass(graph: Graph) -> Iterator[Process]:
-    with graph.node("bass-ros") as process:
-        yield process
 
 
 @pytest.fixture(scope="module")
@@ -113,18 +106,3 @@ def test_played_from_the_middle_and_with_a_loss(graph: Graph, recorded: Recorded
     signal[:, 6000:9000] = 0
     result = expected(signal[:, 1000:end], BLOCK, VALUES)["input"]
     np.testing.assert_array_equal(np.stack((message.left, message.right))[:, -result.shape[1] :], result)
-
-
-def test_source_of_bass(graph: Graph, bass: Process, recorded: Recorded) -> None:
-    """`bag:` publishes the recorded frames with their frame indices."""
-    audio = serialization.message_class("bass", "::binaudio::portStruct")
-    with graph.collect("/bass/Audio", audio) as messages:
-        wait_for(lambda: messages, what="the message of the live run")
-        acquire(graph, f"bag:{recorded.bag}")
-        wait_for(lambda: len(messages) > 2 and messages[-1].lastFrameIndex == FRAMES)
-    del messages[0]
-    assert messages[0].lastFrameIndex == 0
-    padded = np.concatenate((np.zeros((2, CHUNK * CHUNKS), np.int32), recorded.sound), axis=1)
-    for message in messages:
-        window = padded[:, message.lastFrameIndex : message.lastFrameIndex + CHUNK * CHUNKS]
-        assert np.array_equal(message.left, window[0]) and np.array_equal(message.right, window[1])

@@ -89,14 +89,3 @@ def test_equal_names_of_coordinate_frames_are_an_error(graph: Graph, bass_node: 
     assert "world_frame: expected another frame than head_frame, got 'head'" in answer.genom_exdetail
     assert graph.call("/bass/getAcquisition").nFramesPerChunk == 400
     graph.call("/bass/Stop")
-
-
-def test_the_built_in_scene_has_a_truth(graph: Graph, bass_node: Process) -> None:
-    message_class = importlib.import_module("bass.msg").SceneTruth
-    with graph.collect("/bass/sceneTruth", message_class) as truths:
-        graph.call("/bass/Acquire", device="scene:?seconds=2", sampleRate=8000, nFramesPerChunk=400, nChunksOnPort=4)
-        wait_for(lambda: len(truths) > 5)
-        graph.call("/bass/Stop")
-    for truth in truths:
-        expected = 90 - 90 * truth.frameIndex / 8000  # from far left to far right in 2 s
-        assert truth.names == ["talker"] and abs(np.degrees(truth.azimuths[0]) - expected) < 1e-6

@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 import struct
 import threading
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -13,15 +12,9 @@ import pytest
 from rosafe.ros1.bass import socket_client
 from rosafe.ros1.bass.socket_client import Received, SocketClient, blocks
 from tests.harness import PATIENCE
-from tests.ros1.bass.test_socket import Server, port_content
+from tests.ros1.bass.test_socket import Server, port_content, server
 
-
-@pytest.fixture
-def server() -> Iterator[Server]:
-    running = Server()
-    yield running
-    running.stopping.set()
-    running.thread.join(PATIENCE)
+__all__ = ["server"]
 
 
 def numbers(block: Received) -> list[int]:

@@ -29,12 +29,6 @@ def audio_class() -> Any:
     return serialization.message_class("bass", "::binaudio::portStruct")
 
 
-@pytest.fixture(scope="module")
-def bass(graph: Graph) -> Iterator[Process]:
-    with graph.node("bass-ros") as process:
-        yield process
-
-
 @pytest.fixture
 def driver(graph: Graph) -> Iterator[Driver]:
     """A driver in this process with topics of its own; stamped messages of four channels."""
@@ -206,7 +200,7 @@ def test_acquire_names_unusable_topics(graph: Graph, bass: Process, driver: Driv
     silent = f"topic:{driver.topic}"
     format_ = "?format=S16LE&rate=16000&of=2"
     expected = {
-        "topic:/nobody": ("e_device", "topic:/nobody: the topic has no publisher; start the driver"),
+        "topic:/nobody": ("e_device", "/nobody: the topic has no publisher; start the driver, or call Acquire of"),
         "topic:a b": ("e_device", "expected the name of a topic, such as /audio"),
         "topic:/bass/Audio": ("e_device", "expected the topic of another node, got the port of this bass"),
         "topic:/rosout": ("e_device", "got type rosgraph_msgs/Log"),

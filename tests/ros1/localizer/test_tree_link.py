@@ -15,17 +15,21 @@ from rosafe.ros1.localizer.status import node_status
 from tests.harness import wait_for
 
 
+class Client:
+    """A client of a component that answers."""
+
+    closed = 0
+
+    @classmethod
+    async def load(cls, *_: Any) -> Client:
+        return cls()
+
+    async def close(self) -> None:
+        Client.closed += 1
+
+
 def test_a_node_that_the_master_does_not_know(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its services answer at their known address; the link waits, closes its client, and tries again."""
-    closed: list[None] = []
-
-    class Client:
-        @classmethod
-        async def load(cls, *_: Any) -> Client:
-            return cls()
-
-        async def close(self) -> None:
-            closed.append(None)
 
     class Graph:
         def __init__(self, *_: Any) -> None:
@@ -39,6 +43,7 @@ def test_a_node_that_the_master_does_not_know(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:1")
     monkeypatch.setattr(tree_link, "Graph", Graph)
+    monkeypatch.setattr(Client, "closed", 0)
     monkeypatch.setattr(tree_link, "ComponentClient", Client)
     monkeypatch.setattr(tree_link, "POLL_SECONDS", 0.01)
     monkeypatch.setattr("rospy.resolve_name", lambda name: name)
@@ -47,7 +52,7 @@ def test_a_node_that_the_master_does_not_know(monkeypatch: pytest.MonkeyPatch) -
     link = tree_link.TreeLink("/rosAFE", "", unused, unused, status)
     link.start()
     try:
-        wait_for(lambda: len(closed) > 2)
+        wait_for(lambda: Client.closed > 2)
         assert status.state() == (WARN, "waiting for rosAFE: /rosAFE is not registered at the master")
     finally:
         link.close()
@@ -58,14 +63,6 @@ def test_a_node_that_was_replaced_leaves_its_processors_to_its_successor(
     monkeypatch: pytest.MonkeyPatch, replaced: bool
 ) -> None:
     removed: list[list[str]] = []
-
-    class Client:
-        @classmethod
-        async def load(cls, *_: Any) -> Client:
-            return cls()
-
-        async def close(self) -> None:
-            pass
 
     class Created:
         names: ClassVar[list[str]] = ["ild"]

@@ -297,6 +297,7 @@ def test_an_unreachable_address_is_reported(
         wait_for(lambda: node.err.endswith(f"{program}: ready as /{name} at {graph.uri}\n"), what=lambda: str(node))
 
 
+@FORKS
 @pytest.mark.parametrize(
     ("command", "ip", "ipv6"),
     [

@@ -112,9 +112,6 @@ def test_one_of_three_concurrent_nodes_remains(graph: Graph) -> None:
             process.close()
 
 
-# --- genomixd and the page --------------------------------------------------------------------------------------
-
-
 # --- one that cannot start --------------------------------------------------------------------------------------
 
 

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import re
 import signal
-import urllib.error
-import urllib.parse
-import urllib.request
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +11,9 @@ import pytest
 import yaml
 
 from rosafe.tree.setups import SetupError, read
-from tests.harness import ROOT, SCRIPTS, Graph, free_port, wait_for
+from tests.harness import ROOT, Graph, wait_for
 from tests.tree.setups.test_files import TREE
+from tests.web.genomix import world as worlds
 
 
 @pytest.fixture
@@ -84,47 +80,28 @@ def test_save_names_what_it_leaves_out(graph: Graph, tmp_path: Path) -> None:
     assert read((tmp_path / "saved.yaml").read_text()).localizer is None
 
 
-def test_by_http_and_tcl(graph: Graph, file: Path, tmp_path: Path) -> None:
-    port = free_port()
+def test_by_http_and_tcl(file: Path, tmp_path: Path) -> None:
     text = file.read_text()
-
-    def ask(service: str, **given: Any) -> Any:
-        query = urllib.parse.urlencode({"input": json.dumps(given)})
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/call/rosAFE/{service}?{query}") as answer:
-            return json.load(answer)
-
-    def serves() -> bool:
-        try:
-            return bool(ask("getParameters"))
-        except OSError:
-            return False
-
-    with ExitStack() as stack:
-        for node in ("bass-ros", "rosAFE-ros"):
-            stack.enter_context(graph.node(node))
-        stack.enter_context(graph.start(str(SCRIPTS / "genomixd"), "-p", str(port)))
-        wait_for(serves, what="genomixd")
-        with pytest.raises(urllib.error.HTTPError) as error:
-            ask("loadSetup", setup=text.replace("kind: ild", "kind: idl"))
-        response = json.load(error.value)
-        assert response["ex"] == "::rosAFE::e_badNewValue"
-        assert "line 12: 'ild': unknown kind 'idl'" in response["detail"]["what"]
-        assert processors(graph) == []
-        assert not graph.call("/bass/getAcquisition").running
-        answer = ask("loadSetup", setup=text)
+    with worlds.world(tmp_path) as world:
+        call = world.http.call
+        with pytest.raises(worlds.HttpError) as refused:
+            call("rosAFE/loadSetup", {"setup": text.replace("kind: ild", "kind: idl")})
+        assert refused.value.ex == "::rosAFE::e_badNewValue"
+        assert "line 12: 'ild': unknown kind 'idl'" in refused.value.what
+        assert call("rosAFE/getProcessors")["processors"] == []
+        assert not call("bass/getAcquisition")["running"]
+        answer = call("rosAFE/loadSetup", {"setup": text})
         assert answer == {"created": ["input", "time", "bank", "ihc", "ild"], "reused": [], "sound": "started"}
-        assert read(ask("saveSetup")["setup"]) == read(text)
-        script = tmp_path / "setup.tcl"
-        script.write_text(
-            f"package require genomix\nset g [::genomix::connect 127.0.0.1:{port}]\n$g load rosAFE\n"
-            f"set f [open {file}]\nputs [::rosAFE::loadSetup [read $f]]\n"
-            "puts [dict get [::rosAFE::saveSetup {full 1}] setup]\n"
-        )
-        done = graph.run("tclsh", str(script), TCLLIBPATH=str(ROOT / "tcl"))
-        first, _, rest = done.stdout.partition("\n")
+        assert read(call("rosAFE/saveSetup")["setup"]) == read(text)
+        first, *rest = world.lines(f"""
+            set g [genomix::connect $address]
+            $g load rosAFE
+            puts [rosAFE::loadSetup [read [open {file}]]]
+            puts [dict get [rosAFE::saveSetup {{full 1}}] setup]
+        """)
         assert first.split(" reused ")[1] == "{0 input 1 time 2 bank 3 ihc 4 ild} sound reused"
-        assert read(rest) == read(text)
-        assert "pp_cutoffHzDC: 20.0" in rest
+        saved = "\n".join(rest)
+        assert read(saved) == read(text) and "pp_cutoffHzDC: 20.0" in saved
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from rosafe.interface import ComponentError
 from rosafe.ros1.client import actions
 from rosafe.ros1.client.actions import ActionClient
 from rosafe.ros1.client.graph import Graph
+from tests.harness import in_loop
 
 
 class Topic:
@@ -46,51 +48,44 @@ class Action:
         self.client._on_status(GoalStatusArray(status_list=[status]))
 
 
-def run(test: Callable[[Action], Awaitable[None]]) -> None:
-    """Run a test on an action of a component that does not run."""
-
-    async def checked() -> None:
-        graph = Graph("http://127.0.0.1:9")
-        await test(Action(ActionClient(graph, "bass", "bass", "Acquire")))
-        await graph.close()
-
-    asyncio.run(checked())
+@asynccontextmanager
+async def action_of_bass() -> AsyncIterator[Action]:
+    """Provide an action of a component that does not run."""
+    graph = Graph("http://127.0.0.1:9")
+    yield Action(ActionClient(graph, "bass", "bass", "Acquire"))
+    await graph.close()
 
 
 @pytest.mark.parametrize("missing", ["goal", "result", "status"])
-def test_a_goal_is_sent_when_its_result_can_be_received(monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
+@in_loop(action_of_bass)
+async def test_a_goal_is_sent_when_its_result_can_be_received(
+    action: Action, /, monkeypatch: pytest.MonkeyPatch, missing: str
+) -> None:
     """A result is sent once: a client that is not connected yet would miss it."""
     monkeypatch.setattr(actions, "REPEAT_SECONDS", 0.01)
-
-    async def check(action: Action) -> None:
-        for topic in (action.goal, action.cancel, action.result, action.status):
-            topic.connections = 1
-        late: Topic = getattr(action, missing)
-        late.connections = 0
-        sending = asyncio.create_task(action.client.send({"device": "scene:"}))
-        done, _ = await asyncio.wait({sending}, timeout=0.2)
-        assert not done and action.goal.sent == []
-        late.connections = 1
-        async with asyncio.timeout(60):
-            while not action.goal.sent:
-                await asyncio.sleep(0.01)
-            action.accept()
-            goal = await sending
-        assert goal.acknowledged.is_set() and action.goal.sent[0].goal.device == "scene:"
-        assert len({message.goal_id.id for message in action.goal.sent}) == 1
-
-    run(check)
+    for topic in (action.goal, action.cancel, action.result, action.status):
+        topic.connections = 1
+    late: Topic = getattr(action, missing)
+    late.connections = 0
+    sending = asyncio.create_task(action.client.send({"device": "scene:"}))
+    done, _ = await asyncio.wait({sending}, timeout=0.2)
+    assert not done and action.goal.sent == []
+    late.connections = 1
+    async with asyncio.timeout(60):
+        while not action.goal.sent:
+            await asyncio.sleep(0.01)
+        action.accept()
+        goal = await sending
+    assert goal.acknowledged.is_set() and action.goal.sent[0].goal.device == "scene:"
+    assert len({message.goal_id.id for message in action.goal.sent}) == 1
 
 
-def test_a_goal_without_an_answer_is_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+@in_loop(action_of_bass)
+async def test_a_goal_without_an_answer_is_cancelled(action: Action, /, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(actions, "ANSWER_SECONDS", 0.1)
-
-    async def check(action: Action) -> None:
-        for topic in (action.goal, action.cancel, action.result, action.status):
-            topic.connections = 1
-        with pytest.raises(ComponentError, match=r"bass did not answer /bass/Acquire within 0\.1 s"):
-            await action.client.send({"device": "scene:"})
-        assert action.cancel.sent[0].id == action.goal.sent[0].goal_id.id
-        assert action.client.goals == {}
-
-    run(check)
+    for topic in (action.goal, action.cancel, action.result, action.status):
+        topic.connections = 1
+    with pytest.raises(ComponentError, match=r"bass did not answer /bass/Acquire within 0\.1 s"):
+        await action.client.send({"device": "scene:"})
+    assert action.cancel.sent[0].id == action.goal.sent[0].goal_id.id
+    assert action.client.goals == {}

@@ -60,15 +60,6 @@ def test_a_foreign_address_is_reported_in_one_line(home_graph: harness.Graph) ->
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_it_listens_on_loopback_by_default(home_graph: harness.Graph) -> None:
-    with worlds.genomixd(home_graph) as (_, port):
-        sockets = harness.proc("net", "tcp").read_text()
-        assert f"0100007F:{port:04X} 00000000:0000 0A" in sockets
-    with worlds.genomixd(home_graph, "--host", "0.0.0.0") as (_, port):
-        assert f"00000000:{port:04X} 00000000:0000 0A" in harness.proc("net", "tcp").read_text()
-        assert Http(port).raw("/")[0] == 200
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_regardless_of_clients(home_graph: harness.Graph, number: int) -> None:
     with worlds.genomixd(home_graph) as (process, port), Http(port).listening(s="x") as events:

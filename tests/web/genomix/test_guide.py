@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import re
-import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import tomllib
 
 from tests import harness
-from tests.web.genomix import world as worlds
 from tests.web.genomix.world import World
 
 pytestmark = pytest.mark.ros
 
 SHELLS = ("tclsh", "eltclsh")
-
-
-@pytest.fixture
-def fresh_world(tmp_path: Path) -> Iterator[World]:
-    """Components that were not used yet."""
-    with worlds.world(tmp_path) as world:
-        yield world
 
 
 def guide_commands() -> list[str]:
@@ -32,22 +22,6 @@ def guide_commands() -> list[str]:
     commands = re.findall(r"^.*eltclsh[ ]*>[ ]*(.*?)[ ]*$", text, re.MULTILINE)
     assert len(commands) == 18
     return [command.replace("hw:1,0", "scene:") for command in commands]
-
-
-def run_shell(world: World, shell: str, script: str) -> subprocess.CompletedProcess[str]:
-    path = world.graph.home / "session.tcl"
-    path.write_text(script, "utf-8")
-    # `genomix::connect` without an address, as in the guide, but not on the default port.
-    return world.graph.run(shell, str(path), GENOMIXD=f"127.0.0.1:{world.port}")
-
-
-def test_the_guide_runs_as_a_script(fresh_world: World) -> None:
-    done = run_shell(fresh_world, "tclsh", "\n".join(guide_commands()) + "\n")
-    assert (done.stdout, done.stderr) == ("", "")
-    parameters = fresh_world.http.call("rosAFE/getParameters")["parameters"]
-    # The script's last requests, such as removeProcessor, are still in progress when it ends.
-    harness.wait_for(lambda: not fresh_world.http.call("rosAFE/getParameters")["parameters"]["preProc"])
-    assert [p["name"] for p in parameters["input"]] == ["input"]
 
 
 PATTERNS = {

@@ -73,13 +73,6 @@ def test_invalid_zeros_and_empty_values_are_rejected(world: World, request_name:
     assert world.http.call("rosAFE/getProcessors") == before
 
 
-def test_zeros_of_plain_ros_clients_stand_for_defaults(world: World) -> None:
-    start(world)
-    done = world.graph.run("rosservice", "call", "/rosAFE/PreProc", "{name: plain, pp_coefPreEmphasis: 0}")
-    assert "genom_success: True" in done.stdout and "genom_exdetail: ''" in done.stdout
-    assert reported_parameters(world, "preProc", "plain")["pp_coefPreEmphasis"] == 0.97
-
-
 def test_the_values_of_get_parameters_create_an_equal_processor(world: World) -> None:
     """With a list of centre frequencies, it reports a spacing of 0."""
     start(world, "PreProc")

@@ -99,6 +99,3 @@ def test_an_invalid_name(graph: Graph, name: str) -> None:
     done = graph.run("genomixd", "--name", name, check=False)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     assert "--name: expected the name of a host" in done.stderr and repr(name) in done.stderr
-
-
-# --- clients ---

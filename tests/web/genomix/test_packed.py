@@ -10,7 +10,6 @@ import json
 import math
 import shutil
 import struct
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from hypothesis import strategies as st
 
 from rosafe import interface
 from rosafe.web.genomix import binary_format
-from tests.harness import PATIENCE, ROOT, proc
+from tests.harness import PATIENCE, ROOT, proc, run_program
 from tests.matlab.octave import script
 from tests.web.genomix.world import World
 
@@ -88,13 +87,10 @@ def octave(folder: Path, text: str) -> list[str]:
     if shutil.which("octave-cli") is None:
         pytest.skip("octave-cli is not installed; scripts/install --tests brings it")
     (folder / "check.m").write_text(f"1;\n{text}", "utf-8")
-    done = subprocess.run(
+    done = run_program(
         ["timeout", "150", "octave-cli", "--norc", "--quiet", "--no-history", "check.m"],
         cwd=folder,
         env={"PATH": "/usr/bin:/bin", "HOME": str(folder), "OCTAVE_PATH": str(ROOT / "matlab"), "LANG": "C.UTF-8"},
-        capture_output=True,
-        text=True,
-        check=False,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout.splitlines()

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -99,60 +98,6 @@ def _settled(world: World, first: str, second: str) -> dict[str, Any]:
     one, two = (world.http.call(f"rosAFE/{port}")[port.partition("/")[0]] for port in (first, second))
     again = world.http.call(f"rosAFE/{first}")[first.partition("/")[0]]
     return two if one["lastFrameIndex"] == two["lastFrameIndex"] == again["lastFrameIndex"] else {}
-
-
-def test_matching_processors_are_reused(sound: World) -> None:
-    """tests/tree/test_requests.py has the rules."""
-    call = sound.http.call
-    assert call("rosAFE/request", ["ild", {"fb_nChannels": 3}])["created"] == CHAIN
-    assert call("rosAFE/request", ["ild", {"fb_nChannels": "3"}])["reused"] == CHAIN
-    response = call("rosAFE/request", ["ratemap", {"fb_nChannels": 3, "ild_hSizeSec": 0.02, "nFramesPerBlock": 100}])
-    assert (response["created"], response["reused"]) == (["ratemap_0"], CHAIN[:-1])
-    assert response["unused"] == ["ild_hSizeSec", "nFramesPerBlock"]
-    assert call("rosAFE/request", ["input"])["port"] == "inputProcPort"
-    call("rosAFE/removeProcessor", ["filterbank_0"])  # the middle of the tree
-    response = call("rosAFE/request", ["ild", {"fb_nChannels": 3}])
-    assert (response["dependencies"], response["reused"]) == (CHAIN, CHAIN[:2])
-
-
-def test_a_failed_request_leaves_no_processor(sound: World) -> None:
-    world, http = sound, sound.http
-    refused = refusal(lambda: http.call("rosAFE/request", ["ild", {"fb_highFreqHz": 30000}]))
-    assert (refused.status, refused.ex) == (422, "::rosAFE::e_badNewValue")
-    assert "expected channels below half the sample rate" in refused.what
-    assert names(world) == []
-    harness.wait_for(lambda: activities(world, "rosAFE") == [])
-    http.call("rosAFE/request", ["time"])
-    refused = refusal(lambda: http.call("rosAFE/request", ["ild", {"fb_nERB": 1}]))
-    assert (refused.ex, refused.status) == ("::genom::serialization", 400)
-    assert names(world) == ["input_0", "time_0"]
-    assert refusal(lambda: http.call("bass/request", ["ild"])).ex == "::genom::no_such_service"
-
-
-def test_four_concurrent_clients(sound: World) -> None:
-    """Two HTTP clients, one of them in a session, and two commands: one tree without duplicates."""
-    channels = ["fb_nChannels=2", "fb_nChannels=2", "fb_nChannels=3", "fb_nChannels=3"]
-
-    def by_http(session: str, count: str) -> Any:
-        query = {"s": session} if session else {}
-        return sound.http.call("rosAFE/request", ["ild", {"fb_nChannels": count[-1]}], **query)
-
-    def by_command(_: str, count: str) -> Any:
-        code, out, err = command(sound, "ild", "--json", count)
-        assert code == 0, err
-        return json.loads(out)
-
-    with ThreadPoolExecutor(4) as pool:
-        works = [(by_http, ""), (by_command, ""), (by_http, "mine"), (by_command, "")]
-        answers = [
-            answer.result()
-            for answer in [pool.submit(work, who, count) for (work, who), count in zip(works, channels, strict=True)]
-        ]
-    assert answers[0]["dependencies"] == answers[1]["dependencies"]
-    assert answers[2]["dependencies"] == answers[3]["dependencies"]
-    assert [s["fb_nChannels"] for s in parameters(sound, "gammatone")] in ([2, 3], [3, 2])
-    assert len(names(sound)) == 8
-    assert sorted(name for answer in answers for name in answer["created"]) == sorted(names(sound))
 
 
 def test_another_instance_and_its_end(world: World) -> None:

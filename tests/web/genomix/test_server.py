@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 
 import pytest
 
@@ -85,32 +84,6 @@ def test_functions_return_their_outputs(world: World) -> None:
     assert world.http.call("rosAFE/getParameters")["parameters"]["preProc"][0]["pp_bRemoveDC"] == 1
 
 
-def test_signals_are_those_of_the_ports(world: World) -> None:
-    """getSignals returns exactly the numbers that the port has published."""
-    start_tree(world.http)
-
-    def arrived() -> bool:
-        return world.http.call("rosAFE/gammatonePort/gammatone")["gammatonePort"]["lastFrameIndex"] > 0
-
-    harness.wait_for(arrived)
-    world.http.call("bass/Stop")
-    signal = world.http.call("rosAFE/getSignals")["signals"]["gammatone"][0]
-    port = world.http.call("rosAFE/gammatonePort/gammatone")["gammatonePort"]
-    frames = signal["framesOnPort"]
-    assert frames > 0
-    assert signal["sampleRate"] == port["sampleRate"] == 44100
-    for ear in ("left", "right"):
-        for new, window in zip(signal[ear]["dataN"], port[ear]["dataN"], strict=True):
-            assert len(new["data"]) == frames
-            common = min(frames, len(window["data"]))
-            assert pack(new["data"][-common:]) == pack(window["data"][-common:])
-    assert any(port["left"]["dataN"][0]["data"])
-
-
-def pack(numbers: list[float]) -> bytes:
-    return struct.pack(f"<{len(numbers)}d", *numbers)
-
-
 def test_tcl_syntax(world: World) -> None:
     start_tree(world.http)
     status, body = world.http.raw("/call/rosAFE/getDependencies?syntax=tcl&input=%5B%22preProc%22%5D")
@@ -186,14 +159,6 @@ def test_an_activity_is_sent_until_it_ends(world: World) -> None:
     assert caught.value.ex == "::genomix::e_noSuchRequest"
 
 
-def test_abort_ends_the_activity(world: World) -> None:
-    number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
-    world.http.get("/request/abort", id=number, s="t")
-    world.http.wait(number, "done")
-    tasks = world.http.call("bass/genom_state")["genom_state"]["task"]
-    harness.wait_for(lambda: not live_activities(world, "bass"), what=lambda: str(tasks))
-
-
 def test_abort_of_a_request_in_progress(world: World) -> None:
     """An activity can be aborted before the component has received it."""
     for _ in range(10):
@@ -217,16 +182,6 @@ def test_requests_of_a_session_are_completed_after_its_end(world: World) -> None
 def live_activities(world: World, component: str) -> list[str]:
     tasks = world.http.call(f"{component}/genom_state")["genom_state"]["task"]
     return [activity["name"] for task in tasks for activity in task["activity"]]
-
-
-def test_requests_without_pauses_are_sent_in_order(world: World) -> None:
-    """Each processor of the chain is requested before its parent has answered."""
-    world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
-    chain = ["bass/Acquire", "rosAFE/InputProc", "rosAFE/PreProc", "rosAFE/GammatoneProc", "rosAFE/IhcProc"]
-    numbers = [world.http.send(chain[0], {"device": "scene:"}), *(world.http.send(name) for name in chain[1:])]
-    dependencies = world.http.call("rosAFE/getDependencies", ["ihc"], s="t")["dependencies"]
-    assert dependencies == ["input", "preProc", "gammatone", "ihc"]
-    assert [world.http.status(number)["status"] for number in numbers] == ["sent"] * 5
 
 
 def test_functions_and_ports_in_the_background(world: World) -> None:
@@ -280,14 +235,6 @@ def test_listeners_get_events(world: World) -> None:
         world.http.raw("/session/stop?s=ears")
         assert next(events) == ("quit", "")
         assert list(events) == []
-
-
-def test_listeners_may_have_tcl(world: World) -> None:
-    with world.http.listening(s="tcl", syntax="tcl") as events:
-        number = world.http.send("rosAFE/removeProcessor", ["x"], s="tcl")
-        why = "there is no processor 'x'; there are: none"
-        reported = f"id {number} status error exception {{ex ::rosAFE::e_noSuchProcessor what {{{why}}}}}"
-        assert next(events) == ("request", reported)
 
 
 # --- ports ------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from rosafe.web.server import connections
 from rosafe.web.server.access import HttpRefusal
 from rosafe.web.server.connections import ClientAccount, Connections, HttpConnection, Limits, _address
 from rosafe.web.server.listener import HttpListener, connection_of
-from tests.harness import PATIENCE
+from tests.harness import PATIENCE, in_loop
 
 LIMITS = Limits(
     max_connections=16,  # 8 of one address, 4 of which may poll
@@ -27,6 +27,7 @@ LIMITS = Limits(
     max_answers=2**20,
     request_seconds=PATIENCE,
 )
+BURST = 128  # connections at once, as many as an address may have
 LARGE = bytes(32 * 2**20)  # more than the buffers of the kernel hold
 
 
@@ -49,9 +50,6 @@ class Client:
     async def get(self, path: str) -> int:
         self.send(path)
         return await self.status()
-
-
-Connect = Callable[[], Awaitable[Client]]
 
 
 def _format(refusal: HttpRefusal) -> tuple[bytes, str]:
@@ -121,28 +119,18 @@ class World:
         return response
 
 
-def run(test: Callable[[World], Awaitable[None]], limits: Limits = LIMITS) -> None:
-    async def limited() -> None:
-        async with asyncio.timeout(PATIENCE), World(limits) as world:
-            await test(world)
-
-    asyncio.run(limited())
-
-
-def test_half_of_the_connections_of_an_address_may_poll() -> None:
-    async def check(world: World) -> None:
-        polls = [await world.connect() for _ in range(4)]
-        for client in polls:
-            client.send("/poll")
-            await world.polling.acquire()
-        other = await world.connect()
-        assert await other.get("/poll") == 503
-        assert await other.get("/now") == 200
-        world.may_answer.set()
-        assert [await client.status() for client in polls] == [200] * 4
-        assert await other.get("/poll") == 200
-
-    run(check)
+@in_loop(World, LIMITS)
+async def test_half_of_the_connections_of_an_address_may_poll(world: World, /) -> None:
+    polls = [await world.connect() for _ in range(4)]
+    for client in polls:
+        client.send("/poll")
+        await world.polling.acquire()
+    other = await world.connect()
+    assert await other.get("/poll") == 503
+    assert await other.get("/now") == 200
+    world.may_answer.set()
+    assert [await client.status() for client in polls] == [200] * 4
+    assert await other.get("/poll") == 200
 
 
 # --- which connections are closed ----------------------------------------------------------------------------------
@@ -246,54 +234,45 @@ def test_addresses_of_one_client(one: str, other: str, same: bool) -> None:
     assert (_address((one, 1)) == _address((other, 2))) is same
 
 
-def test_the_token_authenticates_a_connection() -> None:
-    async def check(world: World) -> None:
-        authenticated = await world.connect()
-        assert await authenticated.get("/token") == 200
-        silent = [await world.connect() for _ in range(7)]
-        assert await (await world.connect()).get("/now") == 200  # the ninth connection
-        assert await silent[0].reader.read() == b""  # the longest silence of those that are not authenticated
-        assert await authenticated.get("/now") == 200
-
-    run(check)
+@in_loop(World, LIMITS)
+async def test_the_token_authenticates_a_connection(world: World, /) -> None:
+    authenticated = await world.connect()
+    assert await authenticated.get("/token") == 200
+    silent = [await world.connect() for _ in range(7)]
+    assert await (await world.connect()).get("/now") == 200  # the ninth connection
+    assert await silent[0].reader.read() == b""  # the longest silence of those that are not authenticated
+    assert await authenticated.get("/now") == 200
 
 
-def test_a_burst_of_requests_does_not_lock_out_other_clients() -> None:
+@in_loop(World, replace(LIMITS, max_connections=BURST))
+async def test_a_burst_of_requests_does_not_lock_out_other_clients(world: World, /) -> None:
     """More requests than an address may have connections arrive before the server has handled the first one."""
-    burst = 128
-
-    async def check(world: World) -> None:
-        for steps in range(12):  # of the event loop, between the burst and the other client
-            with ExitStack() as stack:
-                for _ in range(burst):
-                    one = stack.enter_context(socket.create_connection(("127.0.0.1", world.port)))
-                    one.sendall(b"GET /now HTTP/1.1\r\nHost: localhost\r\n\r\n")
-                for _ in range(steps):
-                    await asyncio.sleep(0)
-                sock = socket.create_connection(("127.0.0.1", world.port))
-                sock.sendall(b"GET /now HTTP/1.1\r\nHost: localhost\r\n\r\n")
-                other = Client(*await asyncio.open_connection(sock=sock))
-                assert await other.status() == 200, steps
-                other.writer.transport.abort()
-
-    run(check, replace(LIMITS, max_connections=burst))
+    for steps in range(12):  # of the event loop, between the burst and the other client
+        with ExitStack() as stack:
+            for _ in range(BURST):
+                one = stack.enter_context(socket.create_connection(("127.0.0.1", world.port)))
+                one.sendall(b"GET /now HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            for _ in range(steps):
+                await asyncio.sleep(0)
+            sock = socket.create_connection(("127.0.0.1", world.port))
+            sock.sendall(b"GET /now HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            other = Client(*await asyncio.open_connection(sock=sock))
+            assert await other.status() == 200, steps
+            other.writer.transport.abort()
 
 
-def test_answers_that_clients_read_slowly_leave_no_memory_for_others() -> None:
+@in_loop(World, LIMITS)
+async def test_answers_that_clients_read_slowly_leave_no_memory_for_others(world: World, /) -> None:
     """The same data may be sent to several clients."""
-
-    async def check(world: World) -> None:
-        slow = await world.connect()
-        slow.send("/large")
-        await world.polling.acquire()
-        other = await world.connect()
-        assert await other.get("/large?other=1") == 503
-        other.send("/large")
-        await world.polling.acquire()
-        assert [await client.status() for client in (slow, other)] == [200, 200]
-        assert await other.get("/large?other=1") == 200
-
-    run(check)
+    slow = await world.connect()
+    slow.send("/large")
+    await world.polling.acquire()
+    other = await world.connect()
+    assert await other.get("/large?other=1") == 503
+    other.send("/large")
+    await world.polling.acquire()
+    assert [await client.status() for client in (slow, other)] == [200, 200]
+    assert await other.get("/large?other=1") == 200
 
 
 def test_a_single_answer_may_be_too_large() -> None:
@@ -316,23 +295,20 @@ async def statuses_until_the_end(client: Client) -> list[bytes]:
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET /now HTTP/1.1\r\nHo", b"GET /now HTTP/1.1\r\nHost: localhost\r\nX: "])
-def test_a_request_without_an_end(sent: bytes) -> None:
+@in_loop(World, replace(LIMITS, request_seconds=0.5))
+async def test_a_request_without_an_end(world: World, /, sent: bytes) -> None:
     """At once, or on a connection that was used before and may be idle; the limit applies to the complete request."""
-
-    async def check(world: World) -> None:
-        new, used = await world.connect(), await world.connect()
+    new, used = await world.connect(), await world.connect()
+    assert await used.get("/now") == 200
+    new.writer.write(sent)
+    slow = asyncio.create_task(byte_by_byte(new)) if sent.endswith(b"X: ") else None
+    assert await statuses_until_the_end(new) == [b"408"]
+    if slow:
+        slow.cancel()
+    if sent:
         assert await used.get("/now") == 200
-        new.writer.write(sent)
-        slow = asyncio.create_task(byte_by_byte(new)) if sent.endswith(b"X: ") else None
-        assert await statuses_until_the_end(new) == [b"408"]
-        if slow:
-            slow.cancel()
-        if sent:
-            assert await used.get("/now") == 200
-            used.writer.write(sent)
-            assert await statuses_until_the_end(used) == [b"408"]
-
-    run(check, replace(LIMITS, request_seconds=0.5))
+        used.writer.write(sent)
+        assert await statuses_until_the_end(used) == [b"408"]
 
 
 async def byte_by_byte(client: Client) -> None:
@@ -341,16 +317,13 @@ async def byte_by_byte(client: Client) -> None:
         await asyncio.sleep(0.05)
 
 
-def test_a_client_that_does_not_read_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+@in_loop(World, LIMITS)
+async def test_a_client_that_does_not_read_is_disconnected(world: World, /, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "STALL_SECONDS", 0.5)
-
-    async def check(world: World) -> None:
-        slow, other = await world.connect(), await world.connect()
-        slow.send("/large")
-        await world.polling.acquire()
-        slow.writer.transport.pause_reading()  # type: ignore[attr-defined]
-        assert await other.get("/large?other=1") == 503
-        while world.connections._answers:
-            await asyncio.sleep(0.01)
-
-    run(check)
+    slow, other = await world.connect(), await world.connect()
+    slow.send("/large")
+    await world.polling.acquire()
+    slow.writer.transport.pause_reading()  # type: ignore[attr-defined]
+    assert await other.get("/large?other=1") == 503
+    while world.connections._answers:
+        await asyncio.sleep(0.01)
