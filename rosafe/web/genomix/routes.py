@@ -309,16 +309,13 @@ class HttpApi:
         pieces = _encoded(request, value)
         if value.size <= BATCH // 8:
             return _respond(request, b"".join(pieces))
-        with self._connections.reading_answer(value.data, value.size):
-            return await self._stream_pieces(request, pieces)
-
-    async def _stream_pieces(self, request: web.Request, pieces: Iterator[bytes]) -> web.StreamResponse:
-        response = web.StreamResponse(headers={"Content-Type": _answer_syntax(request).content_type, **_HEADERS})
-        await response.prepare(request)
         loop = asyncio.get_running_loop()
-        while batch := await loop.run_in_executor(self._formatters, _batch, pieces):
-            await response.write(batch)
-        await response.write_eof()
+        with self._connections.reading_answer(value.data, value.size):
+            response = web.StreamResponse(headers=_headers(request))
+            await response.prepare(request)
+            while batch := await loop.run_in_executor(self._formatters, _batch, pieces):
+                await response.write(batch)
+            await response.write_eof()
         return response
 
 
@@ -467,9 +464,12 @@ def _encoded(request: web.Request, value: Value | Request) -> Iterator[bytes]:
     return syntax.document(value.pieces(syntax) if isinstance(value, Request) else syntax.structure(*value.content))
 
 
+def _headers(request: web.Request) -> dict[str, str]:
+    return {"Content-Type": _answer_syntax(request).content_type, **_HEADERS}
+
+
 def _respond(request: web.Request, body: bytes, status: int = 200) -> web.Response:
-    headers = {"Content-Type": _answer_syntax(request).content_type, **_HEADERS}
-    return web.Response(body=body, status=status, headers=headers)
+    return web.Response(body=body, status=status, headers=_headers(request))
 
 
 def _small(request: web.Request, value: Any) -> web.Response:
