@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import array
 import functools
-import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,35 +19,18 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface import ComponentError
 from rosafe.localization import cues
 from rosafe.localization.direction_model import DirectionModel
-from rosafe.localization.live import (
-    OK,
-    WARN,
-    FixedHead,
-    FrameFormat,
-    FrameQueue,
-    HeadRotation,
-    LocalizationLoop,
-    Mute,
-    NewFrames,
-    Status,
-    StreamRestartedError,
-)
-from rosafe.localization.live_streams import LiveSound, LiveStreams
-from rosafe.localization.localizer import Localizer
-from rosafe.localization.settings import LocalizerSettings, Models
-from rosafe.localization.speech import SPEAKS
+from rosafe.localization.live import OK, WARN, FrameFormat, NewFrames, Status, StreamRestartedError, Transforms
+from rosafe.localization.live_node import MAX_PARTS, LiveLocalizer, MessageClasses, SourceTopics
+from rosafe.localization.live_streams import LiveSound
+from rosafe.localization.settings import LocalizerSettings
 from rosafe.localization.status import NodeStatus
-from rosafe.localization.stored_noise import StoredNoise
-from rosafe.localization.streams import RATE, SourcePart
-from rosafe.localization.tracker import FORGOTTEN, PRESENT, Track
-from rosafe.ros2.messages import numbers, ros_time
+from rosafe.ros2.messages import ros_time
 from rosafe.ros2.outputs import QUEUE, FramePosition
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 
 CHECK_SECONDS = 0.5  # between two checks of the processors
 MAX_FRAMES = 10_000  # that wait for the thread that localizes
-MAX_PARTS = 200  # of streams for a slow subscriber: at least a second; older ones are dropped
 
 
 class TreeFrames:
@@ -151,105 +132,28 @@ def _slice(parts: list[tuple[int, FloatArray]], first: int, end: int) -> FloatAr
     return np.concatenate(pieces, axis=-1)
 
 
-class SourcePublishers:
-    """Publishes sources, poses, the posterior, and the sound of each source.
+class SourcePublishers(SourceTopics):
+    """Publishes sources, poses, the posterior, and the sound of each source: see `SourceTopics`."""
 
-    Parameters
-    ----------
-    node : Node
-    frame_id : str
-        Coordinate frame of all azimuths.
-    speech_only : bool
-        Whether only sources that speak have poses.
-
-    Attributes
-    ----------
-    streams : LiveStreams
-        Provides the probability that a source speaks.
-    """
-
-    streams: LiveStreams
-
-    def __init__(self, node: Node, frame_id: str, speech_only: bool = False) -> None:
-        self._frame_id, self._speech_only = frame_id, speech_only
-        self._first_id = self._last_id = 0
-        topics = {"sources": SoundSources, "poses": PoseArray, "posterior": DirectionPosterior}
+    def __init__(self, node: Node, frame_id: str, speech_only: bool) -> None:
+        super().__init__(MessageClasses(Header, Pose, SoundSource, ros_time), frame_id, speech_only)
+        topics = {"sources": SoundSources, "poses": PoseArray, "posterior": DirectionPosterior, "streams": SourceAudio}
         self._publishers = {
-            name: node.create_publisher(message, f"~/{name}", QoSProfile(depth=QUEUE))
+            name: node.create_publisher(
+                message, f"~/{name}", QoSProfile(depth=MAX_PARTS if name == "streams" else QUEUE)
+            )
             for name, message in topics.items()
         }
-        self._parts = node.create_publisher(SourceAudio, "~/streams", QoSProfile(depth=MAX_PARTS))
 
-    def begin_again(self) -> None:
-        """Prepare for tracks that are numbered from 1 again: published ids continue."""
-        self._first_id = self._last_id
-        self.streams.begin_again(self._first_id)
+    def has_subscribers(self, topic: str) -> bool:
+        """See `SourceTopics`."""
+        return bool(self._publishers[topic].get_subscription_count())
 
-    def has_stream_subscribers(self) -> bool:
-        """Return whether the sound of sources is used."""
-        return bool(self._parts.get_subscription_count())
-
-    def has_speech_subscribers(self) -> bool:
-        """Return whether the probability that a source speaks is used."""
-        names = ("sources", "poses") if self._speech_only else ("sources",)
-        return any(self._publishers[name].get_subscription_count() for name in names)
-
-    def publish_part(self, part: SourcePart, time: float) -> None:
-        """Publish the next samples of a source, of which the first is that of a clock time (s)."""
-        if self.has_stream_subscribers():
-            message = SourceAudio(
-                header=Header(stamp=ros_time(time), frame_id=self._frame_id),
-                id=part.id,
-                azimuth=math.radians(part.azimuth),
-                sample_rate=RATE,
-                first_sample=part.first_sample,
-                samples=array.array("h", part.samples.tobytes()),
-            )
-            self._parts.publish(message)
-
-    def publish(self, time: float, tracks: Sequence[Track], gain_db: float, estimate: tuple[Any, Any]) -> None:
-        """Publish the state at a clock time (s); see `Publishing`."""
-        header = Header(stamp=ros_time(time), frame_id=self._frame_id)
-        named = [track for track in tracks if track.id and track.probability >= FORGOTTEN]
-        self._last_id = max([self._last_id, *(self._first_id + track.id for track in named)])
-        posed = [track for track in named if track.probability > PRESENT and self._has_pose(track)]
-        self._send("sources", header, lambda: {"sources": [self._source(track, gain_db) for track in named]})
-        self._send("poses", header, lambda: {"poses": [_pose(track.azimuth) for track in posed]})
-        self._send(
-            "posterior",
-            header,
-            lambda: {"azimuths": numbers(np.radians(estimate[0])), "probability": numbers(estimate[1])},
-        )
-
-    def _send(self, name: str, header: Header, fields: Callable[[], Mapping[str, Any]]) -> None:
-        publisher = self._publishers[name]
-        if publisher.get_subscription_count():
-            publisher.publish(publisher.msg_type(header=header, **fields()))
-
-    def _speech(self, track: Track) -> float:
-        return self.streams.speech(self._first_id + track.id)
-
-    def _has_pose(self, track: Track) -> bool:
-        return not self._speech_only or self._speech(track) > SPEAKS
-
-    def _source(self, track: Track, gain_db: float) -> SoundSource:
-        return SoundSource(
-            id=self._first_id + track.id,
-            azimuth=math.radians(track.azimuth),
-            azimuth_std=math.radians(track.azimuth_std),
-            probability=float(track.probability),
-            level=float(track.level_db(gain_db)),
-            first_seen=ros_time(track.first_time),
-            last_seen=ros_time(track.last_time),
-            speech=self._speech(track),
-        )
-
-
-def _pose(azimuth: float) -> Pose:
-    pose = Pose()
-    half = math.radians(azimuth) / 2
-    pose.orientation.z, pose.orientation.w = math.sin(half), math.cos(half)
-    return pose
+    def send(self, topic: str, fields: Callable[[], Mapping[str, Any]]) -> None:
+        """See `SourceTopics`."""
+        if self.has_subscribers(topic):
+            publisher = self._publishers[topic]
+            publisher.publish(publisher.msg_type(**fields()))
 
 
 class Localization:
@@ -262,8 +166,8 @@ class Localization:
         The tree of the node.
     publishers : SourcePublishers
     status : NodeStatus
-    head : HeadRotation or None
-        None: azimuths are relative to the head.
+    transforms : Transforms or None
+        Of the head; None: azimuths are relative to it.
     clock : callable
         Returns the clock time in s.
     open_sound : callable
@@ -281,31 +185,21 @@ class Localization:
         tree: Any,
         publishers: SourcePublishers,
         status: NodeStatus,
-        head: HeadRotation | None,
+        transforms: Transforms | None,
         clock: Callable[[], float],
         open_sound: Callable[[float, Status], LiveSound],
     ) -> None:
         self._tree, self._status, self._open_sound = tree, status, open_sound
-        self._models = Models(settings)
-        self._models.report = self._report_learning
-        noise = StoredNoise(settings.noise, status)
-        status.value("head", settings.head)
-        queue = FrameQueue(head or FixedHead(), Mute(settings.audio_delay, status, clock))
         self._closing = threading.Event()
         self._wake = threading.Event()
-        create = functools.partial(_localizer, settings.seconds, noise)
-        self._streams = publishers.streams = LiveStreams(
-            publishers.publish_part, publishers.has_stream_subscribers, publishers.has_speech_subscribers, status
-        )
-        self._loop = LocalizationLoop(create, publishers, queue, status, self._wake.set, clock, self._streams.update)
+        self._localizer = LiveLocalizer(settings, publishers, status, transforms, clock, self._wake.set, self._closing)
         self._watched: dict[Processor, Mapping[str, Any]] = {}
         self._created: list[str] = []
         self._thread = threading.Thread(target=self._run, name="localizer", daemon=True)
 
     def start(self) -> None:
         """Start the threads."""
-        self._loop.start()
-        self._streams.start()
+        self._localizer.start()
         self._thread.start()
 
     def check_now(self) -> None:
@@ -317,13 +211,7 @@ class Localization:
         self._closing.set()
         self._wake.set()
         self._thread.join(1.0)
-        self._loop.close()
-        self._streams.close()
-
-    def _report_learning(self, part: float) -> None:
-        if self._closing.is_set():
-            raise InterruptedError("the node ends")
-        self._status.set("rosAFE", OK, f"learning the directions of the head: {10 * int(10 * part)} %")
+        self._localizer.close()
 
     # --- the thread ---
 
@@ -350,14 +238,14 @@ class Localization:
         if not rate:
             self._status.set("rosAFE", WARN, "waiting for sound")
             return
-        model = self._models.model_for(rate)
+        model = self._localizer.model_for(rate)
         processors = self._request(model)
         grid = FrameGrid.design(rate, "cc", model.parameters)
         format_ = FrameFormat(rate, model.channels, len(grid.window), grid.hop, self._tree.block())
         names = ", ".join(processor.name for processor in processors.values())
         self._status.set("rosAFE", OK, f"localizing with {names}")
-        self._streams.connect(model, functools.partial(self._open_sound, rate, self._status))
-        self._loop.connect(model, lambda received: self._open(processors, format_, received))
+        open_sound = functools.partial(self._open_sound, rate, self._status)
+        self._localizer.connect(model, open_sound, functools.partial(self._open, processors, format_))
 
     def _request(self, model: DirectionModel) -> dict[str, Processor]:
         found: dict[str, Processor] = {}
@@ -380,14 +268,7 @@ class Localization:
         """Forget the processors, and remove those that only this localizer has used."""
         if self._watched:
             self._watched = {}
-            self._loop.connect(None)
-            self._streams.connect(None)
+            self._localizer.disconnect()
             self._tree.consumers.clear()
             self._tree.remove_unused(self._created)
             self._created = []
-
-
-def _localizer(seconds: float, noise: StoredNoise, model: DirectionModel) -> Localizer:
-    localizer = Localizer(model.sample_rate, model, seconds, keep_history=False)
-    noise.apply(localizer)
-    return localizer

@@ -41,14 +41,13 @@ from std_srvs.srv import Trigger
 from rosafe.declarations.text import did_you_mean, join_names
 from rosafe.dsp import kernels
 from rosafe.interface import BASS, BLOCK_AND_BUFFERS, ComponentError, format_value
-from rosafe.localization.live import ERROR, OK, WARN, TransformedHead
+from rosafe.localization.live import ERROR, OK, WARN
 from rosafe.localization.rotations import RotationBuffer
 from rosafe.localization.settings import checked_settings
 from rosafe.localization.status import NodeStatus
 from rosafe.representations import PROBLEMS, WARNINGS
-from rosafe.ros2 import transforms
 from rosafe.ros2.localization import Localization, SourcePublishers
-from rosafe.ros2.messages import clock_offset, diagnostics
+from rosafe.ros2.messages import TruthTopics, clock_offset, diagnostics, subscribe_transforms
 from rosafe.ros2.node_tree import NodeTree
 from rosafe.ros2.outputs import Outputs, topics_of
 from rosafe.ros2.parameters import ProcessorParameters
@@ -104,7 +103,7 @@ class RosafeNode:
         for remark in (*(f"left out: {problem}" for problem in PROBLEMS), *WARNINGS):
             log.warning(f"plugin {remark}")
         frames = self._values["world_frame"] or WORLD, self._values["frame_id"]
-        truth = transforms.TruthTopics(self.node, frames, self.now)
+        truth = TruthTopics(self.node, frames, self.now)
         self.sound = Sound(
             functools.partial(clock_offset, self.node), log, truth.publish, functools.partial(open_device, self.node)
         )
@@ -230,16 +229,14 @@ class RosafeNode:
         """Start the localizer with the settings of a setup, or else those of the parameters."""
         own = {name: self._values[name] for name in ("head", "world_frame", "speech_only")}
         settings = checked_settings({**own, "head_frame": self._values["frame_id"], **given})
-        head = None
+        transforms = None
         if settings.world_frame:
             log = ThrottledLog(self.node.get_logger().warning, 60.0)
-            buffer = RotationBuffer(settings.world_frame, settings.head_frame, log)
-            transforms.subscribe(self.node, buffer)
-            names = settings.world_frame, settings.head_frame, settings.audio_delay
-            head = TransformedHead(buffer, *names, self._status)
+            transforms = RotationBuffer(settings.world_frame, settings.head_frame, log)
+            subscribe_transforms(self.node, transforms)
         publishers = SourcePublishers(self.node, settings.frame_id, settings.speech_only)
         open_sound = functools.partial(SeparatedSound, self.sound)
-        localization = Localization(settings, self.tree, publishers, self._status, head, self.now, open_sound)
+        localization = Localization(settings, self.tree, publishers, self._status, transforms, self.now, open_sound)
         self._localizer, self._localization = dict(given), localization
         localization.start()
 

@@ -39,6 +39,8 @@ class NodeTree:
     health : ProcessorHealth
     consumers : list of FrameConsumer
         Get all blocks.
+    find, stop, remove_unused, existing : callable
+        As of `Tree` and `TreeBuilder`: find a processor by its name; remove all, or some without use; describe all.
     """
 
     def __init__(
@@ -47,10 +49,10 @@ class NodeTree:
         self.tree = Tree(outputs, real_time=True)
         self.health = outputs.health = ProcessorHealth(self.tree, log.warning, log.error)
         self.consumers: list[FrameConsumer] = outputs.consumers
-        self.find = self.tree.find
+        self.find, self.stop = self.tree.find, self.tree.stop
         self.time_of = sound.time_of
         self._builder = TreeBuilder(self.tree, lambda processor: None)
-        self.remove_unused = self._builder.remove_unused
+        self.remove_unused, self.existing = self._builder.remove_unused, self._builder.processors
         self._sound = sound
         self._block = frames_per_block
         self._reserved = frozenset(reserved)
@@ -118,10 +120,6 @@ class NodeTree:
         """Remove a processor and its descendants; return their names."""
         return [processor.name for processor in self.tree.remove(name)]
 
-    def stop(self) -> None:
-        """Remove all processors."""
-        self.tree.stop()
-
     # --- setups ---
 
     def load(self, setup: Setup) -> TreePlan:
@@ -133,10 +131,6 @@ class NodeTree:
     def describe(self) -> Setup:
         """Return the tree as a setup, without sound."""
         return Setup(processors=tuple(map(setup_processor, self._builder.processors())))
-
-    def existing(self) -> list[ExistingProcessor]:
-        """Return the descriptions of all processors, parents first."""
-        return self._builder.processors()
 
 
 def _named(plan: TreePlan, found: Sequence[ExistingProcessor], names: Mapping[str, str] = {}) -> TreePlan:

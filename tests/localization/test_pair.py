@@ -15,8 +15,7 @@ from rosafe.localization import angles, training
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.scene import SceneRenderer
 from rosafe.localization.scene_file import SceneError, read_scene
-from rosafe.ros1.localizer.node import Models
-from rosafe.ros1.localizer.settings import LocalizerSettings
+from rosafe.localization.settings import LocalizerSettings, Models
 from tests.localization.conftest import RATE, modulated
 
 SPEED_OF_SOUND = 343.0

@@ -1,23 +1,24 @@
-"""The bass node: requests, the port Audio, diagnostics."""
+"""The bass node: requests, the port Audio, the truth of a scene, diagnostics."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
+import math
 import os
 import threading
 from collections.abc import Callable
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.audio.devices import SoundSource, device_lines, open_source
 from rosafe.audio.devices.alsa import AlsaSource, DeviceBusyError
+from rosafe.audio.devices.base import wall_time_ns
 from rosafe.audio.stream.capture import Capture, Snapshot, check_window
-from rosafe.audio.stream.truth import TruthSource
+from rosafe.audio.stream.truth import TruthLoop, TruthSource
 from rosafe.interface import BASS, ComponentError
-from rosafe.ros1.bass.scene_truth import TruthPublisher
 from rosafe.ros1.bass.socket_server import DEFAULT_HOST, DEFAULT_PORT, DedicatedSocket
 from rosafe.ros1.bass.topic_source import TopicSource
 from rosafe.ros1.component import serialization
@@ -28,6 +29,9 @@ from rosafe.ros1.transport import master
 from rosafe.ros1.transport.publisher import Publisher
 from rosafe.system.log_throttle import ThrottledLog
 from rosafe.system.terminal import printable
+
+if TYPE_CHECKING:
+    from rosafe.localization.scene import Truth  # imports scipy, which the options of bass-ros need not wait for
 
 FRAMES: tuple[str, ...] = ("world", "head")  # default names of coordinate frames
 MASTER_SECONDS = 1.0  # that Acquire waits for a master that does not answer
@@ -196,6 +200,78 @@ class BassNode:
         status.add("last loss", self._last_loss)
         status.add("last end", self._last_end)
         return status
+
+
+# --- the truth of a scene -----------------------------------------------------------------------------------------
+
+
+class TruthPublisher(TruthLoop):
+    """Publishes the truth of one scene; a context.
+
+    Parameters
+    ----------
+    source : TruthSource
+        The scene.
+    publisher : Publisher
+        Of the topic sceneTruth.
+    message_class : type
+        `bass.msg.SceneTruth`.
+    frames : tuple of two str
+        Names of the world's and of the head's coordinate frame in tf.
+    """
+
+    def __init__(self, source: TruthSource, publisher: Any, message_class: Any, frames: tuple[str, ...]) -> None:
+        super().__init__(source, self._publish_truth)
+        self._publisher = publisher
+        self._message_class = message_class
+        self._transform = _HeadTransform(*frames)
+
+    def __exit__(self, *_: object) -> None:
+        """End, and take the transform back."""
+        super().__exit__()
+        self._transform.close()
+
+    def _publish_truth(self, frame: int, moment: float, truth: Truth) -> None:
+        stamp = rospy.Time(*divmod(wall_time_ns(moment), 1_000_000_000))
+        yaw = math.radians(truth.head_yaw)
+        azimuths = [math.radians(azimuth) for azimuth in truth.azimuths]
+        self._publisher.publish(
+            self._message_class(stamp=stamp, frameIndex=frame, head_yaw=yaw, names=list(truth.names), azimuths=azimuths)
+        )
+        self._transform.publish(stamp, yaw)
+
+
+class _HeadTransform:
+    """The transform from world to head on /tf; nothing if the messages of tf2 are not installed."""
+
+    def __init__(self, world: str, head: str) -> None:
+        try:
+            from geometry_msgs.msg import TransformStamped
+            from tf2_msgs.msg import TFMessage
+        except ImportError:
+            rospy.logwarn("the rotation of the head is not published on /tf: tf2_msgs is missing; run scripts/install")
+            self._publisher = None
+            return
+        self._publisher = Publisher("/tf", TFMessage)
+        self._message_class = TFMessage
+        self._transform = TransformStamped(child_frame_id=head)
+        self._transform.header.frame_id = world
+
+    def publish(self, stamp: rospy.Time, yaw: float) -> None:
+        """Publish a rotation about the z axis (rad)."""
+        if self._publisher is not None:
+            self._transform.header.stamp = stamp
+            rotation = self._transform.transform.rotation
+            rotation.z, rotation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+            self._publisher.publish(self._message_class([self._transform]))
+
+    def close(self) -> None:
+        """Unregister."""
+        if self._publisher is not None:
+            self._publisher.unregister()
+
+
+# --- start --------------------------------------------------------------------------------------------------------
 
 
 def main(argv: list[str] | None = None) -> int:

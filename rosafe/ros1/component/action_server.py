@@ -13,9 +13,8 @@ import rospy
 from actionlib_msgs.msg import GoalStatus, GoalStatusArray
 
 from rosafe.interface import ComponentError, Service
-from rosafe.ros1.component.activities import Activity, too_many
+from rosafe.ros1.component.activities import Activity, RequestDispatcher, too_many
 from rosafe.ros1.component.explicit_defaults import has_explicit_defaults
-from rosafe.ros1.component.request_dispatcher import RequestDispatcher, report_error
 from rosafe.ros1.transport.publisher import BufferList, Publisher
 
 DEFAULT_FREQUENCY = 5.0  # Hz, as of every action server
@@ -185,6 +184,12 @@ class GoalHandler:
     def _set_succeeded(self, goal: Any, error: ComponentError | None) -> None:
         text = report_error(self._service, error) if error is not None else ""
         goal.set_succeeded(self._result(genom_success=error is None, genom_exdetail=text))
+
+
+def report_error(service: Service, problem: ComponentError) -> str:
+    """Log the error of a request, and return its exdetail for the client."""
+    rospy.logwarn(f"{service.name}: {problem.ex}" + (f": {problem}" if str(problem) != problem.ex else ""))
+    return problem.exdetail
 
 
 def _accept_when_running(goal: Any, activity: Activity) -> None:

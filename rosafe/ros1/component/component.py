@@ -21,10 +21,17 @@ import rospy
 from rosafe import interface
 from rosafe.declarations.text import short_repr
 from rosafe.interface import ComponentError
-from rosafe.ros1.component.action_server import GoalHandler, StatusPublisher
-from rosafe.ros1.component.activities import Activities, Activity, Handler, unexpected_error
+from rosafe.ros1.component.action_server import GoalHandler, StatusPublisher, report_error
+from rosafe.ros1.component.activities import (
+    STOP_WAIT,
+    Activities,
+    Activity,
+    Handler,
+    RequestDispatcher,
+    Values,
+    unexpected_error,
+)
 from rosafe.ros1.component.explicit_defaults import has_explicit_defaults, warning_exdetail
-from rosafe.ros1.component.request_dispatcher import STOP_WAIT, RequestDispatcher, Values, report_error
 from rosafe.ros1.component.state_publisher import Diagnostics, StatePublisher
 from rosafe.ros1.transport import master, registration
 from rosafe.ros1.transport.publisher import Publisher

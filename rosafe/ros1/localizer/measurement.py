@@ -20,8 +20,8 @@ from rosafe.localization.live import OK, NewFrames, StreamRestartedError
 from rosafe.localization.noise import NoiseCalibration, measured_level
 from rosafe.localization.settings import LocalizerSettings, Models
 from rosafe.ros import FrameClock
-from rosafe.ros1.localizer.frame_source import PortSource
-from rosafe.ros1.localizer.status import node_status
+from rosafe.ros1.localizer.inputs import PortSource
+from rosafe.ros1.localizer.settings import node_status
 from rosafe.ros1.localizer.tree_link import LocalizerPorts, TreeLink
 from rosafe.system.terminal import printable
 
@@ -119,11 +119,6 @@ class FrameListener:
         raise NoFramesError(f"no frames of rosAFE for {SOUND_SECONDS:g} s: {text}")
 
 
-def levels_of(model: DirectionModel, frames: NewFrames) -> FloatArray:
-    """Return the level (F, C) of frames of both ears in dB, as in `rosafe.localization.cues`."""
-    return cues.quantize(frames.features, cues.scaling_db(model.parameters), model.max_itd).level
-
-
 def ear_levels(model: DirectionModel, frames: NewFrames) -> FloatArray:
     """Return the level (F, 2) of the left and the right ear in dB full scale."""
     power = np.asarray(frames.features["ratemap"]).sum(axis=1).T
@@ -145,7 +140,7 @@ def calibrate(listener: FrameListener, seconds: float, path: Path, say: Callable
     hop, frames = 0.0, 0
     for model, new in listener.listen(seconds + WAIT_SECONDS):
         hop = float(model.parameters["cc_hSizeSec"])
-        parts.append(levels_of(model, new))
+        parts.append(cues.quantize(new.features, cues.scaling_db(model.parameters), model.max_itd).level)
         frames += len(new.middles)
         if frames * hop >= seconds:
             break

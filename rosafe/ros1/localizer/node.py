@@ -11,25 +11,19 @@ import rospy
 from std_msgs.msg import Bool
 
 from rosafe.declarations.errors import ComponentError
-from rosafe.localization.direction_model import DirectionModel
-from rosafe.localization.live import OK, FixedHead, FrameQueue, LocalizationLoop, Mute, TransformedHead
-from rosafe.localization.live_streams import LiveStreams
-from rosafe.localization.localizer import Localizer
-from rosafe.localization.settings import LocalizerSettings, Models
-from rosafe.localization.stored_noise import StoredNoise
+from rosafe.localization.live_node import LiveLocalizer
+from rosafe.localization.rotations import RotationBuffer
+from rosafe.localization.settings import LocalizerSettings
 from rosafe.ros import FrameClock
 from rosafe.ros1.component.state_publisher import Diagnostics
-from rosafe.ros1.localizer.frame_source import PortSource
+from rosafe.ros1.localizer.inputs import InputSound, PortSource
 from rosafe.ros1.localizer.publishers import Publishers
-from rosafe.ros1.localizer.settings import read_settings
-from rosafe.ros1.localizer.sound import InputSound
-from rosafe.ros1.localizer.status import node_status
-from rosafe.ros1.localizer.transforms import TransformBuffer
+from rosafe.ros1.localizer.settings import node_status, read_settings
 from rosafe.ros1.localizer.tree_link import LocalizerPorts, TreeLink
 from rosafe.ros1.transport import registration
+from rosafe.system.log_throttle import ThrottledLog
 
 UP_SECONDS = 10.0  # to register a node that starts at the master
-PROGRESS_STEP = 0.1  # of the part of a head that is learned, between two lines in the log
 
 
 class LocalizerNode:
@@ -52,39 +46,27 @@ class LocalizerNode:
         self._status = node_status(self._diagnostics.changed)
         try:
             settings = read_settings(options)
-            self._models = Models(settings)
-            noise = StoredNoise(settings.noise, self._status)
+            self._localizer = LiveLocalizer(
+                settings,
+                Publishers(settings.frame_id, settings.speech_only),
+                self._status,
+                _transforms(settings),
+                rospy.get_time,
+                lambda: self._link.check_now(),
+                self.finished,
+            )
         except ValueError as problem:
             raise ComponentError("::localizer::e_badNewValue", str(problem)) from None
-        self._status.value("head", settings.head)
         self._diagnostics.add("localization", self._status.report)
-        self._models.report = self._report_learning
+        localizer = self._localizer
+        rospy.Subscriber("~mute", Bool, lambda m: localizer.mute.set(m.data), queue_size=10, tcp_nodelay=True)
         afe = rospy.resolve_name(settings.rosafe)
-        self._transforms = _transforms(settings)
-        mute = Mute(settings.audio_delay, self._status, rospy.get_time)
-        self._mute = rospy.Subscriber("~mute", Bool, lambda m: mute.set(m.data), queue_size=10, tcp_nodelay=True)
         self._clock = FrameClock(afe)
-        names = settings.world_frame, settings.head_frame, settings.audio_delay
-        head = FixedHead() if self._transforms is None else TransformedHead(self._transforms, *names, self._status)
-        publishers = Publishers(settings.frame_id, settings.speech_only)
-        self._streams = publishers.streams = LiveStreams(
-            publishers.publish_part, publishers.has_stream_subscribers, publishers.has_speech_subscribers, self._status
-        )
-        self._loop = LocalizationLoop(
-            functools.partial(_localizer, settings.seconds, noise),
-            publishers,
-            FrameQueue(head, mute),
-            self._status,
-            lambda: self._link.check_now(),
-            rospy.get_time,
-            self._streams.update,
-        )
         self._link = TreeLink(
-            afe, settings.connect, self._models.model_for, self._connect, self._status, self._loop.is_stalled
+            afe, settings.connect, localizer.model_for, self._connect, self._status, localizer.is_stalled
         )
         registration.registrar().settle(UP_SECONDS)
-        self._loop.start()
-        self._streams.start()
+        localizer.start()
         self._link.start()
         threading.Thread(target=self._diagnostics.run, name="diagnostics", daemon=True).start()
 
@@ -94,45 +76,33 @@ class LocalizerNode:
             self.finished.set()
             self._diagnostics.changed()
             self._link.close()
-            self._loop.close()
-            self._streams.close()
-            if self._transforms is not None:
-                self._transforms.close()
-            self._mute.unregister()
+            self._localizer.close()
 
     def _connect(self, ports: LocalizerPorts | None) -> None:
         if ports is None:
-            self._loop.connect(None)
-            self._streams.connect(None)
+            self._localizer.disconnect()
         else:
-            open_sound = functools.partial(InputSound, ports.audio, ports.format.sample_rate, self._clock, self._status)
-            self._streams.connect(ports.model, open_sound)
-            self._loop.connect(ports.model, functools.partial(PortSource, ports.topics, ports.format, self._clock))
-
-    def _report_learning(self, part: float) -> None:
-        """Show the progress of learning in the log and in /diagnostics; raises InterruptedError if the node ends."""
-        if self.finished.is_set():
-            raise InterruptedError("the node ends")
-        shown = int(part / PROGRESS_STEP) * round(100 * PROGRESS_STEP)
-        self._status.set("rosAFE", OK, f"learning the directions of the head: {shown} %")
+            rate = ports.format.sample_rate
+            self._localizer.connect(
+                ports.model,
+                functools.partial(InputSound, ports.audio, rate, self._clock, self._status),
+                functools.partial(PortSource, ports.topics, ports.format, self._clock),
+            )
 
 
-def _localizer(seconds: float, noise: StoredNoise, model: DirectionModel) -> Localizer:
-    localizer = Localizer(model.sample_rate, model, seconds, keep_history=False)
-    noise.apply(localizer)
-    return localizer
-
-
-def _transforms(settings: LocalizerSettings) -> TransformBuffer | None:
+def _transforms(settings: LocalizerSettings) -> RotationBuffer | None:
     """Return the transforms of the head, subscribed; None if azimuths are relative to it."""
     if not settings.world_frame:
         return None
     try:
-        transforms = TransformBuffer(settings.world_frame, settings.head_frame)
-        transforms.subscribe()
+        from tf2_msgs.msg import TFMessage
     except ImportError as problem:
         raise ComponentError(
             "::localizer::e_badNewValue",
             f"world_frame: expected the Python modules of tf2 ({problem}); run scripts/install",
         ) from None
-    return transforms
+    buffer = RotationBuffer(settings.world_frame, settings.head_frame, ThrottledLog(rospy.logwarn, 60.0))
+    for topic, static in (("/tf", False), ("/tf_static", True)):
+        add = functools.partial(buffer.add_message, static=static, seconds=rospy.Time.to_sec)
+        rospy.Subscriber(topic, TFMessage, add, queue_size=100, tcp_nodelay=True)
+    return buffer

@@ -1,16 +1,18 @@
-"""The settings of the localizer: options of the command line, then private ROS parameters, then defaults."""
+"""The settings of the localizer: options, then private ROS parameters, then defaults; and its state, in rospy's log."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import rosgraph.names
 import rospy
 
 from rosafe.declarations.text import short_repr
+from rosafe.localization.live import ERROR, OK, WARN
 from rosafe.localization.settings import LocalizerSettings, checked_settings
+from rosafe.localization.status import NodeStatus
 
 
 def read_settings(options: Mapping[str, Any], node: str = "~") -> LocalizerSettings:
@@ -32,3 +34,8 @@ def read_settings(options: Mapping[str, Any], node: str = "~") -> LocalizerSetti
         if value and not rosgraph.names.is_legal_name(value):
             raise ValueError(f"{name}: expected a ROS name, got {short_repr(value)}")
     return settings
+
+
+def node_status(changed: Callable[[], None]) -> NodeStatus:
+    """Return a state that calls `changed` after each change."""
+    return NodeStatus(changed, {OK: rospy.loginfo, WARN: rospy.logwarn, ERROR: rospy.logerr})

@@ -21,9 +21,8 @@ from rosafe.ros1.client.errors import bad_value, middleware_error
 from rosafe.ros1.client.graph import Graph, NotRegisteredError
 from rosafe.ros1.client.values import parse_input
 from rosafe.system.version import VERSION
-from rosafe.web.genomix import binary_format
+from rosafe.web.genomix.formats import JSON, PACKED, SYNTAXES, Syntax
 from rosafe.web.genomix.sessions import Request, Session, Sessions
-from rosafe.web.genomix.text_formats import JSON, SYNTAXES, TCL, Syntax, plain, structure
 from rosafe.web.server.access import HttpRefusal, check_host, check_no_browser, host_name
 from rosafe.web.server.connections import Connections, Limits
 from rosafe.web.server.listener import HttpListener, connection_of
@@ -62,7 +61,6 @@ _STATUS = {
 }
 _COMPONENT_ERROR = 422  # the component has rejected the request
 _SESSION_NAME = re.compile(r"[\w.:@-]{1,100}")
-_PACKED = "packed"  # the only binary syntax
 _HELP = """genomixd {version}: HTTP access (GET) to the components of the ROS graph.
 Namespace: {namespace}
 Answers are JSON; with syntax=tcl they are Tcl dicts, with syntax=packed binary data for MATLAB and Octave.
@@ -145,8 +143,7 @@ class HttpApi:
             if request.method == "GET" and request.body_exists:
                 raise HttpRefusal(400, "expected a GET request without a body")
             _check_url(request)
-            if not _is_packed(request):
-                _syntax(request)
+            _syntax(request)
             if not request.path.startswith("/session/"):
                 session = self._session(request)
                 session.busy += 1
@@ -201,7 +198,7 @@ class HttpApi:
 
     async def _session_listen(self, request: web.Request) -> web.StreamResponse:
         with self._connections.long_poll(connection_of(request)):
-            return await _send_events(request, self._session(request), _syntax(request))
+            return await _send_events(request, self._session(request), _syntax(request, binary=False))
 
     # --- components ---
 
@@ -312,16 +309,13 @@ class HttpApi:
         pieces = _encoded(request, value)
         if value.size <= BATCH // 8:
             return _respond(request, b"".join(pieces))
-        with self._connections.reading_answer(value.data, value.size):
-            return await self._stream_pieces(request, pieces)
-
-    async def _stream_pieces(self, request: web.Request, pieces: Iterator[bytes]) -> web.StreamResponse:
-        response = web.StreamResponse(headers={"Content-Type": _media_type(request), **_HEADERS})
-        await response.prepare(request)
         loop = asyncio.get_running_loop()
-        while batch := await loop.run_in_executor(self._formatters, _batch, pieces):
-            await response.write(batch)
-        await response.write_eof()
+        with self._connections.reading_answer(value.data, value.size):
+            response = web.StreamResponse(headers=_headers(request))
+            await response.prepare(request)
+            while batch := await loop.run_in_executor(self._formatters, _batch, pieces):
+                await response.write(batch)
+            await response.write_eof()
         return response
 
 
@@ -339,10 +333,10 @@ async def _send_events(request: web.Request, session: Session, syntax: Syntax) -
                 await response.write(b":\n\n")
                 continue
             if isinstance(data, Request):
-                data = "".join(_unwrapped(syntax, data.pieces(syntax)))
-            elif data:
-                data = _plain_text(syntax, data)
-            await response.write(_utf8(f"event: {event}\ndata: {data}\n\n"))
+                content = b"".join(syntax.document(data.pieces(syntax)))
+            else:
+                content = syntax.plain_document(data) if data else b""
+            await response.write(b"event: %s\ndata: %s\n\n" % (event.encode(), content))
             if event == "quit":
                 return response
     finally:
@@ -420,20 +414,18 @@ def _check_url(request: web.Request) -> None:
         raise bad_value("URL: expected UTF-8") from None
 
 
-def _is_packed(request: web.Request) -> bool:
-    return request.query.get("syntax") == _PACKED
-
-
-def _syntax(request: web.Request) -> Syntax:
-    name = request.query.get("syntax", "json")
-    if name not in SYNTAXES:
-        raise bad_value(f"syntax: expected one of {', '.join((*SYNTAXES, _PACKED))}, got {name[:20]!r}")
+def _syntax(request: web.Request, binary: bool = True) -> Syntax:
+    """Return the syntax that a client requests; ``::genom::serialization`` if it is unknown, or binary for events."""
+    name = request.query.get("syntax", JSON.name)
+    known = [known for known, syntax in SYNTAXES.items() if binary or syntax is not PACKED]
+    if name not in known:
+        raise bad_value(f"syntax: expected one of {', '.join(known)}, got {name[:20]!r}")
     return SYNTAXES[name]
 
 
 def _answer_syntax(request: web.Request) -> Syntax:
     """Return the syntax of an answer; JSON for the error about an unknown syntax."""
-    return SYNTAXES.get(request.query.get("syntax", "json"), JSON)
+    return SYNTAXES.get(request.query.get("syntax", JSON.name), JSON)
 
 
 async def _accepted(sent: Request, seconds: float, *events: asyncio.Event) -> None:
@@ -467,57 +459,28 @@ def _text(text: str) -> web.Response:
     return web.Response(text=text, headers=_HEADERS)
 
 
-def _utf8(text: str) -> bytes:
-    """Encode a text. An unpaired surrogate, which a node may send, has no UTF-8 and is escaped, as in exdetail."""
-    return text.encode("utf-8", "backslashreplace")
-
-
-def _unwrapped(syntax: Syntax, pieces: Iterator[str]) -> Iterator[str]:
-    """Yield a complete document: without the outermost braces in Tcl, which would make it a list of one element."""
-    if syntax is not TCL:
-        yield from pieces
-        return
-    previous = next(pieces)[1:]
-    for piece in pieces:
-        yield previous
-        previous = piece
-    yield previous[:-1]
-
-
-def _plain_text(syntax: Syntax, value: Any) -> str:
-    """Return the complete document of a small value without a type."""
-    return "".join(_unwrapped(syntax, iter((plain(syntax, value),))))
-
-
 def _encoded(request: web.Request, value: Value | Request) -> Iterator[bytes]:
-    if _is_packed(request):
-        return value.packed() if isinstance(value, Request) else binary_format.structure(*value.content)
     syntax = _syntax(request)
-    pieces = value.pieces(syntax) if isinstance(value, Request) else structure(syntax, *value.content)
-    return (_utf8(piece) for piece in _unwrapped(syntax, pieces))
+    return syntax.document(value.pieces(syntax) if isinstance(value, Request) else syntax.structure(*value.content))
 
 
-def _media_type(request: web.Request) -> str:
-    if _is_packed(request):
-        return "application/octet-stream"
-    return f"{_answer_syntax(request).media_type}; charset=utf-8"
+def _headers(request: web.Request) -> dict[str, str]:
+    return {"Content-Type": _answer_syntax(request).content_type, **_HEADERS}
 
 
 def _respond(request: web.Request, body: bytes, status: int = 200) -> web.Response:
-    return web.Response(body=body, status=status, headers={"Content-Type": _media_type(request), **_HEADERS})
+    return web.Response(body=body, status=status, headers=_headers(request))
 
 
 def _small(request: web.Request, value: Any) -> web.Response:
-    if _is_packed(request):
-        return _respond(request, binary_format.plain(value))
-    return _respond(request, _utf8(_plain_text(_syntax(request), value)))
+    return _respond(request, _syntax(request).plain_document(value))
 
 
 def _error(request: web.Request, error: ComponentError, status: int = 0) -> web.Response:
-    if _is_packed(request):  # MATLAB and Octave ignore the body of an answer with another status than 200
-        return _respond(request, binary_format.error(error.body))
-    body = _utf8(_plain_text(_answer_syntax(request), error.body))
-    return _respond(request, body, status or _STATUS.get(error.ex, _COMPONENT_ERROR))
+    syntax = _answer_syntax(request)
+    if syntax is PACKED:  # MATLAB and Octave ignore the body of an answer with another status than 200
+        return _respond(request, syntax.error(error.body))
+    return _respond(request, syntax.error(error.body), status or _STATUS.get(error.ex, _COMPONENT_ERROR))
 
 
 def _refusal_error(refusal: HttpRefusal) -> ComponentError:
@@ -526,7 +489,7 @@ def _refusal_error(refusal: HttpRefusal) -> ComponentError:
 
 
 def _format_refusal(refusal: HttpRefusal) -> tuple[bytes, str]:
-    return _utf8(plain(JSON, _refusal_error(refusal).body)), JSON.media_type
+    return JSON.error(_refusal_error(refusal).body), "application/json"
 
 
 def _status(request: web.Request, known: Request) -> web.Response:

@@ -17,8 +17,7 @@ from rosafe.ros1.client.asyncio_tools import wait_any
 from rosafe.ros1.client.component_client import NOTHING, Call, ComponentClient, Value, names
 from rosafe.ros1.client.errors import cannot_load, too_many
 from rosafe.ros1.client.graph import Graph
-from rosafe.web.genomix import binary_format, text_formats
-from rosafe.web.genomix.text_formats import Syntax, plain
+from rosafe.web.genomix.formats import Syntax
 
 MAX_SESSIONS = 1000
 MAX_REQUESTS = 1000  # kept or in progress, per session
@@ -99,42 +98,23 @@ class Request:
         if self.output_size > KEPT_BYTES:
             self.value, self._output_included = NOTHING, False
 
-    def pieces(self, syntax: Syntax) -> Iterator[str]:
-        """Yield the status as text: id, status, warning, and output or exception, if there are any."""
-        yield syntax.open("struct")
-        status = self._status_members()
-        yield "".join(
-            syntax.key(index, name) + plain(syntax, value) for index, (name, value) in enumerate(status.items())
-        )
-        if self._has_output:
-            yield syntax.key(len(status), "output")
-            yield from text_formats.structure(syntax, *self.value.content)
-        yield syntax.close("struct")
-
-    def packed(self) -> Iterator[bytes]:
-        """Yield the status in the binary format."""
-        yield binary_format.STRUCTURE
-        for name, value in self._status_members().items():
-            yield binary_format.member(name) + binary_format.plain(value)
-        if self._has_output:
-            yield binary_format.member("output")
-            yield from binary_format.structure(*self.value.content)
-        yield binary_format.END
-
-    def _status_members(self) -> dict[str, Any]:
-        """Return the status without its output."""
+    def pieces(self, syntax: Syntax) -> Iterator[Any]:
+        """Yield the status: id, status, warning, and output or exception, if there are any."""
         status: dict[str, Any] = {"id": self.id, "status": self.status}
+        has_output = self.status == "done" and self._output_included
         if self.warning:
             status["warning"] = self.warning
         if self.error is not None:
             status["exception"] = self.error.body
-        elif self.status == "done" and not self._output_included:
+        elif self.status == "done" and not has_output:
             status["large"] = self.output_size
-        return status
-
-    @property
-    def _has_output(self) -> bool:
-        return self.status == "done" and self._output_included
+        members = (syntax.key(index, name) + syntax.plain(value) for index, (name, value) in enumerate(status.items()))
+        yield syntax.open("struct")
+        yield syntax.join(members)
+        if has_output:
+            yield syntax.key(len(status), "output")
+            yield from syntax.structure(*self.value.content)
+        yield syntax.close("struct")
 
 
 class Session:

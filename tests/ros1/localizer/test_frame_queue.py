@@ -10,7 +10,7 @@ import pytest
 
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization.live import AFTER_SECONDS, FixedHead, FrameQueue, Mute, NewFrames, Rotation
-from rosafe.ros1.localizer.status import node_status
+from rosafe.ros1.localizer.settings import node_status
 
 
 def frames(*middles: float) -> NewFrames:

@@ -13,8 +13,8 @@ from tf2_msgs.msg import TFMessage
 
 from rosafe.localization import angles, rotations
 from rosafe.localization.live import MAX_WAIT, OK, WARN, TransformedHead
-from rosafe.ros1.localizer.status import node_status
-from rosafe.ros1.localizer.transforms import TransformBuffer
+from rosafe.localization.rotations import RotationBuffer
+from rosafe.ros1.localizer.settings import node_status
 from tests.harness import Graph, wait_for
 from tests.ros1.localizer.room import Room
 from tests.ros1.localizer.session import running_localizer
@@ -42,7 +42,7 @@ class Head:
 
     def __init__(self, delay: float = 0.0) -> None:
         self.status = node_status(lambda: None)
-        self.transforms = TransformBuffer("world", "head")
+        self.transforms = RotationBuffer("world", "head", lambda line, kind: None)
         self.head = TransformedHead(self.transforms, "world", "head", delay, self.status)
 
     def tf(self, *found: TransformStamped, static: bool = False) -> None:

@@ -18,8 +18,8 @@ from rosafe.localization.head import Head
 from rosafe.localization.live import OK, FixedHead, FrameFormat, FrameQueue, LocalizationLoop
 from rosafe.localization.localizer import Localizer
 from rosafe.processing.stream import Stream
-from rosafe.ros1.localizer.frame_source import _HEAD, PortSource
-from rosafe.ros1.localizer.status import node_status
+from rosafe.ros1.localizer.inputs import PortSource
+from rosafe.ros1.localizer.settings import node_status
 from tests.localization.conftest import RATE, modulated
 
 BLOCK = RATE  # 1 s
@@ -78,14 +78,12 @@ class Robot:
             found = features[port.kind]
             left, right = found if found.ndim == 3 else (found, None)
             message: Any = SimpleNamespace(
-                data=_HEAD.pack(100, self.index, found.shape[-1]),
+                lastFrameIndex=self.index,
                 framesOnPort=found.shape[-1],
                 left=left,
                 right=right,
                 problem="",
-                missing="sound",
             )
-            message.decode = lambda message=message: message
             port._receive(message)
         self.loop._attempt(self.loop._use_new_frames)
         self.loop._attempt(self.loop._publish)

@@ -17,8 +17,8 @@ import rospy
 import scipy.signal
 import soundfile
 
+from rosafe.ros1.localizer.inputs import InputSound
 from rosafe.ros1.localizer.publishers import source_markers
-from rosafe.ros1.localizer.sound import InputSound
 from rosafe.ros1.transport.paths import PYPI_DIR
 from tests.harness import PYTHON, ROOT, Graph, Process, private_graph, wait_for
 from tests.localization.conftest import MUSIC, TALKER, take

@@ -11,7 +11,7 @@ import pytest
 from rosafe.localization.live import WARN
 from rosafe.ros1.client.graph import NotRegisteredError
 from rosafe.ros1.localizer import tree_link
-from rosafe.ros1.localizer.status import node_status
+from rosafe.ros1.localizer.settings import node_status
 from tests.harness import wait_for
 
 

@@ -14,7 +14,7 @@ import rospy
 
 from rosafe.localization.live import ERROR, OK, WARN, FixedHead, FrameQueue, LocalizationLoop, NewFrames
 from rosafe.ros1.localizer import tree_link
-from rosafe.ros1.localizer.status import node_status
+from rosafe.ros1.localizer.settings import node_status
 from tests.harness import wait_for
 
 

@@ -20,7 +20,7 @@ from rosafe.ros1.transport import handshake_server, received_data, server_limits
 from rosafe.tree.setups import markup, reading
 from rosafe.web.genomix import daemon, sessions
 from rosafe.web.genomix import routes as api
-from rosafe.web.live import client, server, subscriptions, views
+from rosafe.web.live import client, server, views
 from rosafe.web.server import connections
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, free_port, proc
 from tests.networks import networks
@@ -132,8 +132,8 @@ def test_the_documented_limits() -> None:
         (MAX_PARAMETERS, reading.MAX_PARAMETER_VALUES),
         (server.MAX_CLIENTS, server.LIMITS.max_connections, server.LIMITS.max_connections // 2),
         (server.LIMITS.request_seconds, server.LIMITS.max_header_bytes // 2**20, MEMORY),
-        (f"{client.MAX_MESSAGE >> 20} MiB", client.MAX_PENDING, subscriptions.MAX_VIEWS, views.MAX_VIEWS),
-        (subscriptions.BYTES_PER_SECOND, 1 / client.PERIOD, client.STALL_SECONDS),
+        (f"{client.MAX_MESSAGE >> 20} MiB", client.MAX_PENDING, client.MAX_VIEWS, views.MAX_VIEWS),
+        (client.BYTES_PER_SECOND, 1 / client.PERIOD, client.STALL_SECONDS),
     ]
     shown = [
         "; ".join(f"{number:.0f}" if not isinstance(number, str) else number for number in numbers)

@@ -21,7 +21,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rosafe import interface
-from rosafe.web.genomix import binary_format
+from rosafe.web.genomix import formats
+from rosafe.web.genomix.formats import PACKED
 from tests.harness import PATIENCE, ROOT, proc, run_program
 from tests.matlab.octave import script
 from tests.web.genomix.world import World
@@ -48,7 +49,7 @@ def same(found: Any, value: Any) -> bool:
 @settings(max_examples=20, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(values)
 def test_plain_values_read_back(value: Any) -> None:
-    assert same(read(binary_format.plain(value)), value)
+    assert same(read(PACKED.plain(value)), value)
 
 
 @settings(max_examples=30, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -59,27 +60,27 @@ def test_signals_read_back(channels: list[list[float]], alike: bool) -> None:
         channels = [(channel + [0.0] * 4)[:3] for channel in channels]
     arrays = [np.array(channel) for channel in channels]
     port = {"sampleRate": 1, "lastFrameIndex": 2**53, "framesOnPort": 3, "numberOfChannels": 4, "left": arrays}
-    data = b"".join(binary_format.pieces(interface.ROSAFE, SPECTRUM, {**port, "right": []}))
+    data = b"".join(PACKED.pieces(interface.ROSAFE, SPECTRUM, {**port, "right": []}))
     found = read(data)
     assert list(found) == [name for name, _ in interface.ROSAFE.structs[SPECTRUM]]
     assert found["lastFrameIndex"] == 2**53
     assert [one["data"] for one in found["left"]["dataN"]] == channels
     one_array = len({len(channel) for channel in channels}) <= 1
-    assert data.count(binary_format.SIGNAL + struct.pack("<I", 2)) == 1 + one_array  # otherwise nested structures
+    assert data.count(formats.SIGNAL + struct.pack("<I", 2)) == 1 + one_array  # otherwise nested structures
     assert found["right"] == {"dataN": []}
 
 
 def test_special_numbers_and_texts() -> None:
-    assert math.isnan(read(binary_format.plain(None)))
-    assert math.isnan(read(binary_format.plain(math.nan)))
-    assert read(binary_format.plain([math.inf, 1])) == [math.inf, 1]
-    assert read(binary_format.plain("\ud800")) == "\\ud800"
+    assert math.isnan(read(PACKED.plain(None)))
+    assert math.isnan(read(PACKED.plain(math.nan)))
+    assert read(PACKED.plain([math.inf, 1])) == [math.inf, 1]
+    assert read(PACKED.plain("\ud800")) == "\\ud800"
     with pytest.raises(genomix.GenoMError) as caught:
-        read(binary_format.error({"ex": "::genom::syserr", "detail": {"code": 11}}))
+        read(PACKED.error({"ex": "::genom::syserr", "detail": {"code": 11}}))
     assert (caught.value.ex, caught.value.detail) == ("::genom::syserr", {"code": 11})
     huge = 10**4000  # a component's error may hold any number that JSON has
-    assert binary_format.plain([huge, -huge, 1]) == binary_format.plain([math.inf, -math.inf, 1])
-    assert binary_format.plain(huge) == binary_format.plain(math.inf)
+    assert PACKED.plain([huge, -huge, 1]) == PACKED.plain([math.inf, -math.inf, 1])
+    assert PACKED.plain(huge) == PACKED.plain(math.inf)
 
 
 def octave(folder: Path, text: str) -> list[str]:
@@ -99,15 +100,13 @@ def octave(folder: Path, text: str) -> list[str]:
 def test_octave_reads_the_same(tmp_path: Path) -> None:
     """The decoder of matlab/ returns cells, or matrices on request."""
     lags = [[np.arange(3.0) + 10 * channel + 100 * lag for channel in range(2)] for lag in range(4)]
-    correlation = b"".join(binary_format.pieces(interface.ROSAFE, "::rosAFE::signalNxND", lags))
+    correlation = b"".join(PACKED.pieces(interface.ROSAFE, "::rosAFE::signalNxND", lags))
     documents = {
-        "plain": binary_format.plain(
-            {"a": [1, 2.5, math.nan], "b": ["x", "äß€", ""], "c": [], "d": {"::e": True}, "e": []}
-        ),
+        "plain": PACKED.plain({"a": [1, 2.5, math.nan], "b": ["x", "äß€", ""], "c": [], "d": {"::e": True}, "e": []}),
         "lags": correlation,
-        "ragged": b"".join(binary_format.pieces(interface.ROSAFE, "::rosAFE::signalND", [np.ones(2), np.zeros(3)])),
-        "error": binary_format.error({"ex": "x"}),
-        "empty": b"".join(binary_format.pieces(interface.ROSAFE, "::rosAFE::signalNxND", [[np.empty(0), np.empty(0)]])),
+        "ragged": b"".join(PACKED.pieces(interface.ROSAFE, "::rosAFE::signalND", [np.ones(2), np.zeros(3)])),
+        "error": PACKED.error({"ex": "x"}),
+        "empty": b"".join(PACKED.pieces(interface.ROSAFE, "::rosAFE::signalNxND", [[np.empty(0), np.empty(0)]])),
     }
     for name, data in documents.items():
         (tmp_path / name).write_bytes(data)
@@ -155,8 +154,8 @@ def test_the_server_answers_packed(world: World) -> None:
 
 def signal(*levels: tuple[str, int], data: bytes = b"") -> bytes:
     """A signal that claims these levels."""
-    sizes = b"".join(binary_format.text(name) + struct.pack("<I", size) for name, size in levels)
-    return binary_format.SIGNAL + struct.pack("<I", len(levels)) + sizes + data
+    sizes = b"".join(formats.packed_text(name) + struct.pack("<I", size) for name, size in levels)
+    return formats.SIGNAL + struct.pack("<I", len(levels)) + sizes + data
 
 
 def documents() -> list[bytes]:
@@ -171,13 +170,11 @@ def documents() -> list[bytes]:
         "right": [],
     }
     return [
-        binary_format.plain(
-            {"a": [1, 2.5], "b": ["x", "ä€", ""], "c": [], "d": {"::e": True}, "e": {"f": {"g": None}}}
-        ),
-        binary_format.error({"ex": "::genom::mwerr", "detail": {"what": "no answer"}}),
-        b"".join(binary_format.pieces(interface.ROSAFE, "::rosAFE::signalNxND", lags)),
-        b"".join(binary_format.pieces(interface.ROSAFE, "::rosAFE::signalND", [np.ones(2), np.zeros(3)])),
-        b"".join(binary_format.pieces(interface.ROSAFE, SPECTRUM, port)),
+        PACKED.plain({"a": [1, 2.5], "b": ["x", "ä€", ""], "c": [], "d": {"::e": True}, "e": {"f": {"g": None}}}),
+        PACKED.error({"ex": "::genom::mwerr", "detail": {"what": "no answer"}}),
+        b"".join(PACKED.pieces(interface.ROSAFE, "::rosAFE::signalNxND", lags)),
+        b"".join(PACKED.pieces(interface.ROSAFE, "::rosAFE::signalND", [np.ones(2), np.zeros(3)])),
+        b"".join(PACKED.pieces(interface.ROSAFE, SPECTRUM, port)),
     ]
 
 
@@ -193,27 +190,25 @@ CRAFTED = [
     signal(),
     signal(("not a name", 1), data=bytes(8)),
     signal(("", 1), data=bytes(8)),
-    binary_format.SIGNAL + struct.pack("<I", 2**32 - 1),
-    binary_format.NUMBERS + struct.pack("<I", 2**32 - 1) + bytes(16),
-    binary_format.NUMBERS + struct.pack("<I", 2**29) + bytes(16),
-    binary_format.TEXT + struct.pack("<I", 2**32 - 1) + b"abc",
-    binary_format.TEXT + struct.pack("<I", 3) + b"\xff\xfe\xed",
-    binary_format.STRUCTURE + b"d" + bytes(8) + binary_format.END,
-    binary_format.STRUCTURE + binary_format.member("a"),
-    binary_format.STRUCTURE,
-    binary_format.SEQUENCE,
-    binary_format.SEQUENCE * 1_000,
-    binary_format.STRUCTURE + binary_format.member("a") + (binary_format.STRUCTURE + binary_format.member("a")) * 1_000,
-    binary_format.SEQUENCE + (binary_format.STRUCTURE + binary_format.END) * 20_100 + binary_format.END,
-    binary_format.STRUCTURE
-    + b"".join(binary_format.member(f"a{i}") + binary_format.number(1) for i in range(20_100))
-    + binary_format.END,
-    binary_format.ERROR,
-    binary_format.ERROR + binary_format.number(1),
-    binary_format.ERROR + binary_format.plain({"what": "x"}),
-    binary_format.ERROR + binary_format.plain({"ex": 7}),
-    binary_format.ERROR * 3,
-    binary_format.plain({"a": 1}) + b"x",
+    formats.SIGNAL + struct.pack("<I", 2**32 - 1),
+    formats.NUMBERS + struct.pack("<I", 2**32 - 1) + bytes(16),
+    formats.NUMBERS + struct.pack("<I", 2**29) + bytes(16),
+    formats.TEXT + struct.pack("<I", 2**32 - 1) + b"abc",
+    formats.TEXT + struct.pack("<I", 3) + b"\xff\xfe\xed",
+    formats.STRUCTURE + b"d" + bytes(8) + formats.END,
+    formats.STRUCTURE + PACKED.string("a"),
+    formats.STRUCTURE,
+    formats.SEQUENCE,
+    formats.SEQUENCE * 1_000,
+    formats.STRUCTURE + PACKED.string("a") + (formats.STRUCTURE + PACKED.string("a")) * 1_000,
+    formats.SEQUENCE + (formats.STRUCTURE + formats.END) * 20_100 + formats.END,
+    formats.STRUCTURE + b"".join(PACKED.string(f"a{i}") + PACKED.plain(1) for i in range(20_100)) + formats.END,
+    formats.ERROR,
+    formats.ERROR + PACKED.plain(1),
+    formats.ERROR + PACKED.plain({"what": "x"}),
+    formats.ERROR + PACKED.plain({"ex": 7}),
+    formats.ERROR * 3,
+    PACKED.plain({"a": 1}) + b"x",
     b"x",
     b"\0" * 100,
     b"HTTP/1.1 200 OK\r\n\r\n",

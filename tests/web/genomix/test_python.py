@@ -20,7 +20,7 @@ import genomix
 import pytest
 from genomix import event, packed
 
-from rosafe.web.genomix import binary_format
+from rosafe.web.genomix.formats import PACKED
 from tests import harness
 from tests.web.genomix import world as worlds
 from tests.web.genomix.test_server import live_activities
@@ -331,7 +331,7 @@ def test_a_new_genomixd_is_used(empty_world: World) -> None:
 
 def test_a_damaged_answer() -> None:
     """tests/web/genomix/test_packed.py decodes whole ones."""
-    data = binary_format.plain({"a": [1.5, math.inf], "b": "text"})
+    data = PACKED.plain({"a": [1.5, math.inf], "b": "text"})
     assert packed.decode(data) == {"a": [1.5, math.inf], "b": "text"}
     for end in range(len(data)):
         with error("::genom::mwerr", "damaged"):

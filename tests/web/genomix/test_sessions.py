@@ -16,8 +16,8 @@ from rosafe.interface import BASS, ROSAFE, ComponentError, Service
 from rosafe.ros1.client.component_client import ComponentClient, Value
 from rosafe.ros1.client.graph import Graph
 from rosafe.web.genomix import sessions
+from rosafe.web.genomix.formats import JSON
 from rosafe.web.genomix.sessions import REQUEST_BYTES, Request, Session, Sessions
-from rosafe.web.genomix.text_formats import JSON
 from tests.harness import in_loop
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from rosafe.web.genomix import binary_format
+from rosafe.web.genomix import formats
+from rosafe.web.genomix.formats import PACKED
 from tests import harness
 from tests.matlab import octave
 
@@ -131,15 +132,15 @@ def test_tcl_reports_invalid_answers(body: bytes, reported: str, tmp_path: Path)
 
 STRANGE = {
     "web page": b"<html>hello</html>",
-    "52 bytes": binary_format.SIGNAL
+    "52 bytes": formats.SIGNAL
     + struct.pack("<I", 3)
     + b"".join(
-        binary_format.text(name) + struct.pack("<I", size) for name, size in (("a", 2**32 - 1), ("b", 1), ("c", 0))
+        formats.packed_text(name) + struct.pack("<I", size) for name, size in (("a", 2**32 - 1), ("b", 1), ("c", 0))
     ),
-    "cut": binary_format.plain({"name": "rosAFE"})[:-3],
-    "number": binary_format.plain(7),
-    "other structure": binary_format.plain({"a": 1}),
-    "no structures": binary_format.plain({"name": "x", "instance": "x", "services": 1, "ports": 2}),
+    "cut": PACKED.plain({"name": "rosAFE"})[:-3],
+    "number": PACKED.plain(7),
+    "other structure": PACKED.plain({"a": 1}),
+    "no structures": PACKED.plain({"name": "x", "instance": "x", "services": 1, "ports": 2}),
 }
 
 

@@ -14,8 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rosafe import interface
-from rosafe.web.genomix import text_formats
-from rosafe.web.genomix.text_formats import JSON, TCL
+from rosafe.web.genomix import formats
+from rosafe.web.genomix.formats import JSON, TCL
 
 READER = r"""
 fconfigure stdin -encoding utf-8
@@ -57,20 +57,20 @@ texts = st.text(st.characters(max_codepoint=0xFFFF, blacklist_categories=["Cs"])
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(texts, max_size=8))
 def test_tcl_reads_words_as_they_were(split: Any, words: list[str]) -> None:
-    assert split(" ".join(map(text_formats.tcl_word, words))) == words
+    assert split(" ".join(map(formats.tcl_word, words))) == words
 
 
 @pytest.mark.parametrize(
     "word", ["", "{", "}", "a b", "\\", "$x", "[exit]", '"', "#", "a\nb", "{a", "a}", ";", "\x00", "é\\"]
 )
 def test_tcl_reads_awkward_words_as_they_were(split: Any, word: str) -> None:
-    text = text_formats.tcl_word(word)
+    text = formats.tcl_word(word)
     assert split(f"{text} next") == [word, "next"]
     assert "\n" not in text
 
 
-def text_of(form: text_formats.Syntax, idl: str, value: Any) -> str:
-    return "".join(text_formats.pieces(form, interface.ROSAFE, idl, value))
+def text_of(form: formats.Syntax, idl: str, value: Any) -> str:
+    return "".join(form.pieces(interface.ROSAFE, idl, value))
 
 
 bits = st.binary(min_size=8, max_size=8).map(lambda raw: float(np.frombuffer(raw, "<f8")[0]))
@@ -88,9 +88,7 @@ def test_numbers_come_back_the_same_in_json(numbers: list[float]) -> None:
             assert read is None
 
 
-@pytest.mark.parametrize(
-    "length", [0, 1, text_formats.STEP - 1, text_formats.STEP, text_formats.STEP + 1, 5 * text_formats.STEP + 7]
-)
+@pytest.mark.parametrize("length", [0, 1, formats.STEP - 1, formats.STEP, formats.STEP + 1, 5 * formats.STEP + 7])
 def test_long_arrays_come_back_the_same(split: Any, length: int) -> None:
     numbers = np.random.default_rng(length).standard_normal(length)
     assert json.loads(text_of(JSON, "sequence<double>", numbers)) == numbers.tolist()
@@ -106,7 +104,7 @@ def test_non_finite_numbers_are_null_but_nan_is_nan_in_tcl() -> None:
     assert text_of(TCL, "sequence<double>", values) == "{0 1.5 1 NaN 2 null 3 null}"
     assert text_of(JSON, "double", math.nan) == "null"
     assert text_of(TCL, "double", math.nan) == "NaN"
-    assert text_formats.plain(TCL, {"a": math.nan, "b": None}) == "{a NaN b null}"
+    assert TCL.plain({"a": math.nan, "b": None}) == "{a NaN b null}"
 
 
 def test_signals_are_nested_as_in_the_messages() -> None:

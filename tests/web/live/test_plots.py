@@ -13,10 +13,9 @@ from rosafe.interface import KINDS, format_value
 from rosafe.ros1.client.port_reader import Frames
 from rosafe.ros1.client.tree_snapshot import ProcessorInfo, TreeSnapshot
 from rosafe.web.live import image_topics
-from rosafe.web.live.client import BrowserConnection
+from rosafe.web.live.client import BrowserConnection, parse_keys
 from rosafe.web.live.health import Health
 from rosafe.web.live.plot_data import PlotLayout, quantize
-from rosafe.web.live.subscriptions import parse_keys
 from rosafe.web.live.views import FLOAT, PIECE, QUANTISED, Hub, Key, View, _Columns
 
 FREQUENCIES = [100.0, 200.0, 400.0]

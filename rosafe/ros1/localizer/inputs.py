@@ -1,9 +1,7 @@
-"""The frames of the ports that localization needs: new ones of all four ports, with their times."""
+"""What the localizer receives from rosAFE: new frames of the four ports that it needs, and the sound of the input."""
 
 from __future__ import annotations
 
-import functools
-import struct
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -12,32 +10,18 @@ import numpy as np
 import rospy
 
 from rosafe.audio.files.windows import MAX_INDEX, WindowStream
+from rosafe.audio.stream.ring_sound import RingSound, loss_report
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.interface import LAYOUTS
 from rosafe.localization import cues
-from rosafe.localization.live import FrameFormat, NewFrames, StreamRestartedError
+from rosafe.localization.live import FrameFormat, NewFrames, Status, StreamRestartedError
 from rosafe.ros import FrameClock
+from rosafe.ros1.afe.audio_input import AudioInput
 from rosafe.ros1.component import serialization
 
 READ_BYTES = 2**17  # per read of a subscriber
 KEPT_MESSAGES = 8  # of each port, until the other ports have the same block
-_HEAD = struct.Struct("<IQQ")  # the beginning of a message: sampleRate, lastFrameIndex, framesOnPort
-
-
-class _Undecoded:
-    """A message with the received bytes in `data`: most messages are replaced by newer ones before they are used."""
-
-    def deserialize(self, data: Any) -> Any:
-        self.data = data
-        return self
-
-    def decode(self) -> Any:
-        return super().deserialize(self.data)  # type: ignore[misc]  # of the message class
-
-
-@functools.cache
-def _message_class(idl: str) -> Any:
-    return type("Message", (_Undecoded, serialization.tolerant_message_class("rosAFE", idl)), {})
+_CURRENT = 2.0  # s, at most, between the newest sound and the newest time of the same stream
 
 
 class _Port:
@@ -55,7 +39,7 @@ class _Port:
         self._used: Any = None
         self._subscriber = rospy.Subscriber(
             topic,
-            _message_class(LAYOUTS[kind].idl),
+            serialization.tolerant_message_class("rosAFE", LAYOUTS[kind].idl),
             self._receive,
             queue_size=KEPT_MESSAGES,
             buff_size=READ_BYTES,
@@ -74,31 +58,25 @@ class _Port:
             self._source.received()
 
     def _keep(self, message: Any) -> None:
-        if len(message.data) < _HEAD.size:
-            self.problem = f"{self.kind}: expected at least {_HEAD.size} bytes, got {len(message.data)}"
+        """Keep a message if it can be used."""
+        if problem := message.problem or self._malformed(message):
+            self.problem = problem
             return
-        _, index, frames = _HEAD.unpack_from(message.data)
-        if index >= MAX_INDEX:
-            self.problem = f"{self.kind}: lastFrameIndex {index} is out of range"
-            return
+        index = int(message.lastFrameIndex)
         if not index:  # a processor that has just started
             return
         if index < self._newest:  # another stream
             self.messages.clear()
-        self._newest, self.window = index, frames * self._format.hop
+        self._newest, self.window = index, int(message.framesOnPort) * self._format.hop
         while len(self.messages) >= KEPT_MESSAGES:
             self.messages.pop(next(iter(self.messages)))
         self.messages[index] = message
 
-    def decode(self, index: int) -> bool:
-        """Decode the message of a block; return whether it can be used. Otherwise it is dropped."""
-        message = self.messages[index].decode()
-        self.problem = message.problem or self._malformed(message)
-        if self.problem:
-            del self.messages[index]
-        return not self.problem
-
     def _malformed(self, message: Any) -> str:
+        if message.lastFrameIndex >= MAX_INDEX:
+            return f"{self.kind}: lastFrameIndex {message.lastFrameIndex} is out of range"
+        if not message.lastFrameIndex:
+            return ""
         for samples in (message.left, message.right) if self.kind == "ratemap" else (message.left,):
             shape = getattr(samples, "shape", ("of several lengths",))
             if shape != (self._format.channels, message.framesOnPort) or not message.framesOnPort:
@@ -107,6 +85,7 @@ class _Port:
 
     def advance(self, index: int) -> None:
         """Use the block up to `index`."""
+        self.problem = ""
         self._used = self.messages[index]
         self.messages = {other: kept for other, kept in self.messages.items() if other > index}
         self.stream.advance(index - 1, self._used.left)
@@ -204,8 +183,6 @@ class PortSource:
             newest = self._newest_block()
             if not self.is_ready() or newest == self._index or not self._has_time(newest):  # or all are sent again
                 return None
-            if not all(port.decode(newest) for port in self._ports):
-                return None
             before, self._index = self._index, newest
             restarted = self._index < before
             for port in self._ports:
@@ -231,3 +208,37 @@ class PortSource:
         back = np.arange(end - first - 1, -1, -1) * hop + self.format.window / 2
         features = {port.kind: port.frames(first, end) for port in self._ports}
         return NewFrames(features, moment - back / self.format.sample_rate, lost)
+
+
+class InputSound(RingSound):
+    """A `LiveSound`, subscribed to the topic of the input: the sound of which sources are separated.
+
+    Parameters
+    ----------
+    topic : str
+    sample_rate : float
+        Hz; sound at another rate is not read.
+    clock : FrameClock
+        Of the rosAFE node, whose frames have the numbers of the sound.
+    status : Status
+        Warns about lost sound.
+    """
+
+    def __init__(self, topic: str, sample_rate: float, clock: FrameClock, status: Status) -> None:
+        self._input = AudioInput(loss_report(status))
+        self._input.connect(topic)
+        self._clock = clock
+        super().__init__(self._input.ring, sample_rate, self._time)
+
+    def _time(self, frame: int) -> float:
+        """Return the clock time of a frame (s); LookupError if times of another stream have arrived last."""
+        with self._ring.lock:
+            newest = self._ring.frames.newest
+        if not self._clock.covers(newest, _CURRENT * self._rate):
+            raise LookupError
+        return float(self._clock.time(frame).ros.to_sec())
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        super().close()
+        self._input.close()

@@ -15,8 +15,8 @@ import rospy
 from rosafe.localization import cues
 from rosafe.localization.live import FrameFormat, StreamRestartedError
 from rosafe.ros import FrameClock, array_msg
-from rosafe.ros1.localizer import frame_source
-from rosafe.ros1.localizer.frame_source import PortSource
+from rosafe.ros1.localizer import inputs
+from rosafe.ros1.localizer.inputs import PortSource
 from tests.harness import Graph, private_graph, wait_for
 from tests.ros1.localizer.conftest import RATE
 from tests.ros1.localizer.session import running_localizer, scene_file, watched, watcher
@@ -65,10 +65,10 @@ def test_messages_of_an_earlier_stream_are_dropped(monkeypatch: pytest.MonkeyPat
     receive: list[Any] = []
     monkeypatch.setattr(rospy, "Subscriber", lambda topic, kind, callback, **_: receive.append(callback))
     source: Any = SimpleNamespace(lock=threading.Lock(), is_ready=lambda: False)
-    port = frame_source._Port("/rosAFE/ildPort/ild", "ild", FrameFormat(16000, 4, 320, 160, 1000), source)
+    port = inputs._Port("/rosAFE/ildPort/ild", "ild", FrameFormat(16000, 4, 320, 160, 1000), source)
 
     def send(index: int) -> None:
-        receive[0](SimpleNamespace(data=frame_source._HEAD.pack(0, index, 10)))
+        receive[0](SimpleNamespace(problem="", lastFrameIndex=index, framesOnPort=10, left=np.zeros((4, 10))))
 
     for index in (1000, 2000, 3000):
         send(index)
