@@ -49,7 +49,7 @@ class ActionServer(actionlib.ActionServer):
     def initialize(self) -> None:
         """Create publishers and subscribers."""
         status = Publisher(f"{rospy.remap_name(self.ns)}/status", GoalStatusArray)  # actionlib's will be the same topic
-        status.impl.on_connection = self._in_use.set
+        status.impl.on_change = self._in_use.set
         super().initialize()
 
     def publish_status(self) -> None:
