@@ -14,6 +14,7 @@ import functools
 import json
 import os
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ from rosafe.results.result_metadata import MAX_TEXT, from_json
 from rosafe.system.output import new_file
 from rosafe.system.terminal import printable
 
-FORMAT = "rosafe direction model 2"
+FORMAT = "rosafe direction model 3"
 WINDOW = 100  # frames for which a floor is estimated while learning
 _SMOOTHING = 0.75  # bins, along ITD and ILD
 _CLASS_SMOOTHING = 0.5  # classes
@@ -72,7 +73,9 @@ MAX_LOG_RATIO = 100.0
 class DirectionModel:
     """Log-likelihood ratios of cues for directions, relative to the mean over all directions.
 
-    For single units, as those of a mixture, they are relative to reverberation without its direct sound.
+    For single units, as those of a mixture, they are relative to reverberation without its direct sound. Units of sound
+    without a room have other tables: means of these and of those that are learned from sounds without a room only. The
+    latter alone take front for back more often.
 
     A model does not change; copies by `copy` are the model itself, which takes tens of megabytes.
 
@@ -92,16 +95,20 @@ class DirectionModel:
         Level of a sound in dB full scale less that of the ratemap summed over ears and channels.
     itd_table, ild_table : ndarray of float32, (rows + 1, A)
         See `rosafe.localization.cues`; the last row is zero.
+    rooms : EvidenceTables
+        For units of any sound, relative to reverberation.
+    dry, dry_or_late : EvidenceTables
+        For units of sound without a room; the second ones are relative to reverberation.
 
     Parameters
     ----------
     description : mapping
         The attributes above without the directions and the tables.
-    itd_table, ild_table : ndarray, (rows + 1, A + 1)
+    itd_table, ild_table, dry_itd_table, dry_ild_table : ndarray, (rows + 1, A + 1)
         The tables with a last column for reverberation.
     """
 
-    def __init__(self, description: Mapping[str, Any], itd_table: np.ndarray, ild_table: np.ndarray) -> None:
+    def __init__(self, description: Mapping[str, Any], *tables: np.ndarray) -> None:
         self.azimuths = angles.grid()
         self.sample_rate = float(description["sample_rate"])
         self.parameters = dict(description["parameters"])
@@ -110,12 +117,12 @@ class DirectionModel:
         self.max_itd = float(description["max_itd"])
         self.level_gain_db = float(description["level_gain_db"])
         # Half precision, as in files, so that a learned and a loaded model give the same numbers.
-        tables = [np.asarray(table, np.float16).astype(np.float32) for table in (itd_table, ild_table)]
-        self.itd_table, self.ild_table = (table[:, :-1].copy() for table in tables)
-        itd, ild = self._reverberation = [table[:, -1].copy() for table in tables]
-        self._tables = kernels.EvidenceTables(
-            self.itd_table, self.ild_table, itd, ild, ITD_BINS, ILD_BINS, LEVEL_CLASSES, LEVEL_STEP
-        )
+        itd, ild, dry_itd, dry_ild = (np.asarray(table, np.float16).astype(np.float32) for table in tables)
+        self.rooms = _evidence_tables(itd, ild)
+        self.itd_table, self.ild_table = self.rooms[:2]
+        self.dry_or_late = _evidence_tables(dry_itd, dry_ild)
+        late = {name: getattr(self.rooms, name) / np.float32(2) for name in ("late_itd", "late_ild")}
+        self.dry = self.dry_or_late._replace(**late)  # without that of the dry part
 
     def __copy__(self) -> DirectionModel:
         return self
@@ -162,28 +169,32 @@ class DirectionModel:
         Sums are exact: the tables have half precision.
         """
         if kernels.compiled():
-            self._tables.add(sums, cues, floor, frames, channels, factor)
+            self.rooms.add(sums, cues, floor, frames, channels, factor)
         else:
             itd_row, ild_row = (rows[:, channels] for rows in self.rows(cues.select(frames), floor))
             itd = self.itd_table[itd_row].sum(axis=0, dtype=np.float64)
             sums[channels] += factor * (itd + self.ild_table[ild_row].sum(axis=0, dtype=np.float64))
 
     def unit_evidence(
-        self, cues: Cues, floor: FloatArray, frames: NDArray[np.intp], exponent: float = 1.0
+        self,
+        tables: kernels.EvidenceTables,
+        cues: Cues,
+        floor: FloatArray,
+        frames: NDArray[np.intp],
+        exponent: float = 1.0,
     ) -> NDArray[np.float32]:
-        """Return the evidence (U, A) of each channel with cues of some frames (n,), relative to reverberation.
+        """Return the evidence (U, A) of each channel with cues of some frames (n,) by one of the model's `tables`.
 
         The weights get an exponent: 0 for ratios without weights.
         """
         valid = cues.valid[frames]
         factors = (self._cue_weights ** (exponent - 1)).astype(np.float32)
         if kernels.compiled():
-            return self._tables.units(cues, floor, frames, int(np.count_nonzero(valid)), factors)
+            return tables.units(cues, floor, frames, int(np.count_nonzero(valid)), factors)
         found = np.zeros((int(np.count_nonzero(valid)), len(self.azimuths)), np.float32)
-        tables = (self.itd_table, self.ild_table)
         for table, late, rows, factor, bins in zip(
-            tables,
-            self._reverberation,
+            (tables.itd, tables.ild),
+            (tables.late_itd, tables.late_ild),
             self.rows(cues.select(frames), floor),
             factors,
             (ITD_BINS, ILD_BINS),
@@ -211,9 +222,16 @@ class DirectionModel:
             np.savez(
                 file,
                 description=np.array(json.dumps(description)),
-                itd_table=np.column_stack((self.itd_table, self._reverberation[0])).astype(np.float16),
-                ild_table=np.column_stack((self.ild_table, self._reverberation[1])).astype(np.float16),
+                **{name: table.astype(np.float16) for name, table in zip(TABLES, self._columns(), strict=True)},
             )
+
+    def _columns(self) -> list[np.ndarray]:
+        """Return the tables with the columns of reverberation."""
+        return [
+            np.column_stack(pair)
+            for one in (self.rooms, self.dry_or_late)
+            for pair in ((one.itd, one.late_itd), (one.ild, one.late_ild))
+        ]
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> DirectionModel:
@@ -227,7 +245,7 @@ class DirectionModel:
         name = printable(os.fspath(path))
         try:
             with open_npz(Path(os.path.expanduser(path))) as (members, read):
-                missing = {"description", "itd_table", "ild_table"} - members.keys()
+                missing = {"description", *TABLES} - members.keys()
                 if missing:
                     raise ValueError(f"it lacks {', '.join(sorted(missing))}")
                 if members["description"].file_size > MAX_TEXT:
@@ -236,7 +254,7 @@ class DirectionModel:
                 rows = description.pop("channels") * CLASSES
                 tables = [
                     _checked_table(read(members[table], (rows * bins + 1, len(angles.grid()) + 1)), table)
-                    for table, bins in (("itd_table", ITD_BINS), ("ild_table", ILD_BINS))
+                    for table, bins in TABLES.items()
                 ]
             return cls(description, *tables)
         except FileNotFoundError:
@@ -267,6 +285,12 @@ def _checked_description(found: Any) -> dict[str, Any]:
     return {**found, "channels": len(described["fb_cfHz"])}
 
 
+def _evidence_tables(itd: NDArray[np.float32], ild: NDArray[np.float32]) -> kernels.EvidenceTables:
+    first, second, late_first, late_second = (t[:, part].copy() for part in (slice(None, -1), -1) for t in (itd, ild))
+    return kernels.EvidenceTables(first, second, late_first, late_second, ITD_BINS, ILD_BINS, LEVEL_CLASSES, LEVEL_STEP)
+
+
+TABLES = {"itd_table": ITD_BINS, "ild_table": ILD_BINS, "dry_itd_table": ITD_BINS, "dry_ild_table": ILD_BINS}
 _OF_CHANNELS = ("fb_lowFreqHz", "fb_highFreqHz", "fb_nERBs")  # without effect, as fb_cfHz is given
 _DESCRIPTION: dict[str, Callable[[Any], bool]] = {
     "sample_rate": lambda found: is_number(found) and MIN_RATE <= found <= MAX_RATE,
@@ -300,18 +324,20 @@ class Histograms:
 
     def __init__(self, channels: int, directions: int) -> None:
         self._shape = channels, COHERENCE_CLASSES, LEVEL_CLASSES
-        self.itd = np.zeros((directions, *self._shape, ITD_BINS), np.float32)
-        self.ild = np.zeros((directions, *self._shape, ILD_BINS), np.float32)
+        # of sounds without a room, and in rooms
+        self.itd = np.zeros((2, directions, *self._shape, ITD_BINS), np.float32)
+        self.ild = np.zeros((2, directions, *self._shape, ILD_BINS), np.float32)
         self._hum_itd, self._late_itd = np.zeros((2, 1, *self._shape, ITD_BINS), np.float32)
         self._hum_ild, self._late_ild = np.zeros((2, 1, *self._shape, ILD_BINS), np.float32)
 
-    def add(self, direction: int | None, cues: Cues) -> None:
+    def add(self, direction: int | None, cues: Cues, in_room: bool = False) -> None:
         """Count the cues of successive frames from one direction; of reverberation if it is None.
 
         Floors are those of windows of `WINDOW` frames.
         """
         late = direction is None
-        itd, ild = (self._late_itd[0], self._late_ild[0]) if late else (self.itd[direction], self.ild[direction])
+        place = int(in_room), direction
+        itd, ild = (self._late_itd[0], self._late_ild[0]) if late else (self.itd[place], self.ild[place])
         for begin in range(0, max(1, len(cues.level) - WINDOW // 2), WINDOW):
             part = cues.select(slice(begin, begin + WINDOW))
             self._count(itd, ild, part, part.valid)
@@ -330,18 +356,24 @@ class Histograms:
 
     def mirror(self, source: NDArray[np.intp]) -> None:
         """Add to each direction d the counts of direction `source[d]` with the ears exchanged."""
-        self.itd += self.itd[source][..., ::-1]
-        self.ild += self.ild[source][..., ::-1]
+        self.itd += self.itd[:, source][..., ::-1]
+        self.ild += self.ild[:, source][..., ::-1]
         self._late_itd += self._late_itd[..., ::-1]
         self._late_ild += self._late_ild[..., ::-1]
 
-    def tables(self, frequencies: FloatArray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tables of `DirectionModel` for ITD and ILD; `frequencies` (C,) in Hz."""
+    def tables(self, frequencies: FloatArray) -> list[np.ndarray]:
+        """Return the tables of `DirectionModel`; `frequencies` (C,) in Hz."""
         itd, ild = _weights(frequencies)
-        return (
-            _log_ratios(np.concatenate((self.itd, self._late_itd)), self._hum_itd, itd),
-            _log_ratios(np.concatenate((self.ild, self._late_ild)), self._hum_ild, ild),
-        )
+        of_itd, of_ild = (self._late_itd, self._hum_itd, itd), (self._late_ild, self._hum_ild, ild)
+        counts = self.itd.sum(axis=0), self.ild.sum(axis=0), self.itd[0], self.ild[0]
+
+        def table(number: int) -> np.ndarray:
+            late, hum, weights = (of_itd, of_ild)[number % 2]
+            return _log_ratios(np.concatenate((counts[number], late)), hum, weights)
+
+        with ThreadPoolExecutor(2) as workers:
+            tables = list(workers.map(table, range(len(counts))))
+        return [*tables[:2], (tables[0] + tables[2]) / 2, (tables[1] + tables[3]) / 2]
 
 
 def _weights(frequencies: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from rosafe.dsp.kernels import EvidenceTables
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 from rosafe.localization.cues import Cues, floors
@@ -116,19 +117,26 @@ class EvidenceWindow:
         number = min(frames, self.filled)
         return (self._count - number + np.arange(number)) % self._frames
 
-    def units(self, frames: int, noise: FloatArray) -> Units:
+    def unit_evidence(
+        self, frames: int, tables: EvidenceTables, exponent: float = UNIT_WEIGHT, step: int = 1
+    ) -> NDArray[np.float32]:
+        """Return that of the channels with cues of each `step`th of the last `frames` frames, (U, A).
+
+        It is in world coordinates.
+        """
+        places = np.ascontiguousarray(self._last(frames)[::step])
+        valid = self._cues.valid[places]
+        evidence = self._model.unit_evidence(tables, self._cues, self._floor, places, exponent)
+        yaw = self._yaw[places]
+        return rotate(evidence, np.broadcast_to(yaw[:, np.newaxis], valid.shape)[valid]) if yaw.any() else evidence
+
+    def units(self, frames: int, noise: FloatArray, tables: EvidenceTables) -> Units:
         """Return the channels with cues of the last `frames` frames, in world coordinates; `noise` (C,) is in dB."""
         places = self._last(frames)
         valid = self._cues.valid[places]
-        evidence = [
-            self._model.unit_evidence(self._cues, self._floor, places, exponent) for exponent in (UNIT_WEIGHT, 1.0)
-        ]
-        if (yaw := self._yaw[places]).any():
-            of_units = np.broadcast_to(yaw[:, np.newaxis], valid.shape)[valid]
-            evidence = [rotate(one, of_units) for one in evidence]
         return Units(
-            evidence[0],
-            evidence[1],
+            self.unit_evidence(frames, tables),
+            self.unit_evidence(frames, tables, 1.0),
             np.broadcast_to(np.arange(valid.shape[1]), valid.shape)[valid],
             self._powers[places][valid] / max(1, len(places)),
             (self._cues.level[places] > noise)[valid],

@@ -18,7 +18,7 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 from rosafe.localization.posterior import fuse
 
-SHARPNESS = 1.0  # factor of the evidence: makes the weights sparse
+DRY_SHARPNESS = 2.15  # factor of the evidence without a room: makes the weights sparse
 ITERATIONS = 20
 MIN_SHARE = 0.08  # of the evidence in a window, of a candidate
 MIN_UNITS = 60  # frames and channels with cues in a window
@@ -26,6 +26,16 @@ MIN_SALIENCE = 0.19  # part of the evidence for a source that is above the noise
 MIN_REST = 0.4  # of the evidence, with which that of a source is compared if the rest is noise
 MAX_CANDIDATES = 6
 SEPARATION = 15.0  # degrees between two candidates, at least
+# Mean ratio of the logarithmic likelihoods of units without a room and in rooms, relative to those in rooms, above which
+# the sound comes without a room, and below which not any more. Talkers without a room have -0.02 to 0.05, those at
+# a direct-to-reverberant ratio of 5 dB at most -0.13, steady noise there -0.16 to -0.01.
+_DRY, _NOT_DRY = -0.02, -0.03
+_FIRST = (
+    -0.2
+)  # of that ratio: a room is assumed for most of a second, as the first sound of a source is dry in rooms, too
+_RATE = 0.2  # of the mean ratio, for each update
+_CLEAR = 0.7  # mean logarithmic likelihood of a unit; less is noise, in which the factor would make sources
+DECISION_STEP = 4  # frames, one of which is used for that ratio
 _LIMIT = 30.0  # of a scaled log-likelihood ratio
 _EQUAL = 1e-3  # log-likelihood ratio; directions that differ by less have equal evidence
 
@@ -88,9 +98,32 @@ class Mixture(NamedTuple):
         return np.asarray((self.likelihood[:, few] @ self.weights[few]) * self.inverse)
 
 
-def fit(evidence: NDArray[np.float32]) -> Mixture:
-    """Return the mixture for the evidence (U, A) of units."""
-    likelihood = np.float32(SHARPNESS) * evidence
+class Surroundings:
+    """Decides whether the sound comes from a room.
+
+    Attributes
+    ----------
+    dry : bool
+        Whether there is no room, or little reverberation.
+    """
+
+    def __init__(self) -> None:
+        self.dry = False
+        self._ratio, self._evidence = _FIRST, 0.0
+
+    def update(self, rooms: NDArray[np.float32], dry: NDArray[np.float32]) -> None:
+        """Take the evidence (U, A) of the same units by the tables for rooms and for none, relative to reverberation."""
+        if len(rooms) >= MIN_UNITS // DECISION_STEP:
+            in_room, without = (-np.log(fit(evidence).inverse) for evidence in (rooms, dry))
+            mean = max(float(np.mean(np.abs(in_room))), _EQUAL)
+            self._ratio += _RATE * (float(np.mean(without - in_room)) / mean - self._ratio)
+            self._evidence += _RATE * (mean - self._evidence)
+            self.dry = self._ratio > (_NOT_DRY if self.dry else _DRY) and self._evidence > _CLEAR
+
+
+def fit(evidence: NDArray[np.float32], sharpness: float = 1.0) -> Mixture:
+    """Return the mixture for the evidence (U, A) of units, times `sharpness`."""
+    likelihood = np.float32(sharpness) * evidence
     np.minimum(likelihood, _LIMIT, out=likelihood)  # with the next line: several times as fast as np.clip
     np.maximum(likelihood, -_LIMIT, out=likelihood)
     np.exp(likelihood, out=likelihood)
@@ -119,7 +152,7 @@ def fit_by_numpy(likelihood: NDArray[np.float32], iterations: int, weights: NDAr
     return inverse
 
 
-def candidates(units: Units, yaw: float) -> list[Candidate]:
+def candidates(units: Units, yaw: float, sharpness: float = 1.0) -> list[Candidate]:
     """Return the directions of sources in the evidence of units, the strongest first.
 
     If several directions have equal evidence, the one in front of a head with `yaw` (degrees) is returned. The power
@@ -128,7 +161,7 @@ def candidates(units: Units, yaw: float) -> list[Candidate]:
     """
     if len(units.evidence) < MIN_UNITS:
         return []
-    mixture = fit(units.evidence)
+    mixture = fit(units.evidence, sharpness)
     weight = mixture.weights
     grid = angles.grid()
     found = []

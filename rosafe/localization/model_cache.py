@@ -20,7 +20,7 @@ from rosafe.localization.training import Progress, learn_head
 from rosafe.system.output import OutputError
 from rosafe.system.trust import foreign, user_cache
 
-VERSION = 7  # of the method; another one makes models on disk obsolete
+VERSION = 8  # of the method; another one makes models on disk obsolete
 _models: weakref.WeakKeyDictionary[Head, dict[str, DirectionModel]] = weakref.WeakKeyDictionary()
 _by_key: weakref.WeakValueDictionary[str, DirectionModel] = weakref.WeakValueDictionary()  # for equal heads
 

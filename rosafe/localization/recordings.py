@@ -85,8 +85,8 @@ def learn_recordings(
     histograms, description = training.count(
         _sounds(recorded, sample_rate, progress), sample_rate, parameters, azimuths, f"recordings {os.fspath(path)}"
     )
-    itd, ild = (_interpolated(table, azimuths) for table in histograms.tables(description["parameters"]["fb_cfHz"]))
-    return DirectionModel({**description, "is_sphere": False}, itd, ild)
+    tables = histograms.tables(description["parameters"]["fb_cfHz"])
+    return DirectionModel({**description, "is_sphere": False}, *(_interpolated(table, azimuths) for table in tables))
 
 
 def _normalized(sound: FloatArray) -> FloatArray:
@@ -107,7 +107,7 @@ def _check(recorded: Mapping[float, FloatArray], sample_rate: float, name: str) 
 
 def _sounds(
     recorded: Mapping[float, FloatArray], sample_rate: float, progress: Progress | None
-) -> Iterator[tuple[float | None, FloatArray]]:
+) -> Iterator[training.Sound]:
     """Return each recording at each signal-to-noise ratio, without a room and in one: a half of it each.
 
     Then follows the reverberation of each room.
@@ -120,19 +120,20 @@ def _sounds(
             half = whole.shape[1] // 2
             sound = whole[:, :half] if index % 2 else whole[:, half:]
             count = sound.shape[1]
-            if index >= len(training.SNR_DB):
+            reverberant = index >= len(training.SNR_DB)
+            if reverberant:
                 sound = training.in_room(sound, _louder(sound), rooms[random.integers(len(rooms))])
             noise = np.zeros((2, count))
             for _ in range(_MIXED):
                 other = everything[random.integers(len(everything))]
                 noise += np.resize(np.roll(other, -int(random.integers(other.shape[1])), axis=1).T, (count, 2)).T
-            yield azimuth, sound + _normalized(noise) * 10 ** (-snr / 20)
+            yield training.Sound(sound + _normalized(noise) * 10 ** (-snr / 20), azimuth, reverberant)
         if progress:
             progress((number + 1) / (len(recorded) + 2))
     count = round(max(training.MIN_LATE_SECONDS, _LATE_SECONDS / len(rooms)) * sample_rate)
     for number, room in enumerate(rooms):
         sound = everything[number % len(everything)]
-        yield None, training.late_sound(np.resize(_louder(sound), count), room)
+        yield training.Sound(training.late_sound(np.resize(_louder(sound), count), room), None, True)
 
 
 def _louder(sound: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -43,6 +43,14 @@ _LEVEL = 0.05  # RMS of the training sounds
 Progress = Callable[[float], None]
 
 
+class Sound(NamedTuple):
+    """Both ears (2, n), azimuth (degrees; None: reverberation without direct sound), and whether it is in a room."""
+
+    ears: FloatArray
+    azimuth: float | None
+    reverberant: bool
+
+
 def learn_head(
     head: Head, sample_rate: float, parameters: Mapping[str, Any] | None = None, progress: Progress | None = None
 ) -> DirectionModel:
@@ -74,7 +82,7 @@ def learn_head(
     length = scipy.fft.next_fast_len(round((seconds + _SKIP_SECONDS) * sample_rate), real=True)
     steady_length = max(round(STEADY_PART * length), round(MIN_STEADY_SECONDS * sample_rate))
 
-    def sounds() -> Iterator[tuple[float | None, FloatArray]]:
+    def sounds() -> Iterator[Sound]:
         for number, azimuth in enumerate(directions):
             direct = filters.response(float(azimuth))
             for index, snr in enumerate((*SNR_DB, *ROOM_SNR_DB, STEADY_SNR_DB)):
@@ -85,45 +93,47 @@ def learn_head(
                     else _training_sound(number + index, length, sample_rate, random)
                 )
                 sound = scipy.signal.oaconvolve(dry[np.newaxis], direct, axes=-1)[:, :length]
-                if not steady and index >= len(SNR_DB):
+                reverberant = not steady and index >= len(SNR_DB)
+                if reverberant:
                     sound = in_room(sound, dry, rooms[random.integers(ROOMS)])
                 noise = noises[(number + index) % 2]
                 count = min(length, steady_length) if steady else length
                 begin = random.integers(noise.shape[1] - count)
-                yield float(azimuth), sound[:, :count] + noise[:, begin : begin + count] * 10 ** (-snr / 20)
+                noisy = sound[:, :count] + noise[:, begin : begin + count] * 10 ** (-snr / 20)
+                yield Sound(noisy, float(azimuth), reverberant)
             if progress:
                 progress((number + 1) / (len(directions) + 2))
         late_length = round(max(MIN_LATE_SECONDS, LATE_PART * SOUND_SECONDS / ROOMS) * sample_rate)
         for number, room in enumerate(rooms):
-            yield None, late_sound(_training_sound(number, late_length, sample_rate, random), room)
+            yield Sound(late_sound(_training_sound(number, late_length, sample_rate, random), room), None, True)
 
     grid = angles.grid()
     histograms, description = count(sounds(), sample_rate, parameters, grid, head.key, cues.max_itd(head.spacing))
     if head.front_back_equal:
         behind = np.abs(grid) > 90
         source = _indices(grid, np.where(grid >= 0, 180 - grid, -180 - grid))
-        histograms.itd[behind], histograms.ild[behind] = histograms.itd[source[behind]], histograms.ild[source[behind]]
+        for counts in (histograms.itd, histograms.ild):
+            counts[:, behind] = counts[:, source[behind]]
     if symmetric:
         histograms.mirror(_indices(grid, -grid))
         poles = _indices(grid, np.array([0.0, 180.0]))
         for counts in (histograms.itd, histograms.ild):
-            counts[poles] = counts[poles].sum(axis=0)
+            counts[:, poles] = counts[:, poles].sum(axis=1, keepdims=True)
     return DirectionModel(
         {**description, "is_sphere": head.front_back_equal}, *histograms.tables(description["parameters"]["fb_cfHz"])
     )
 
 
 def count(
-    sounds: Iterable[tuple[float | None, FloatArray]],
+    sounds: Iterable[Sound],
     sample_rate: float,
     parameters: Mapping[str, Any] | None,
     azimuths: FloatArray,
     key: str,
     max_itd: float = cues.MAX_ITD,
 ) -> tuple[Histograms, dict[str, Any]]:
-    """Count the cues of sounds, pairs of one of `azimuths` and both ears (2, n) with a power of 1 before the head.
+    """Count the cues of sounds with a power of 1 before the head, from one of `azimuths` each.
 
-    Reverberation without its direct sound has None instead of the azimuth.
     Returns the histograms and the description of the model.
     """
     described = cues.describe(sample_rate, parameters)
@@ -131,18 +141,18 @@ def count(
     histograms = Histograms(len(described["fb_cfHz"]), len(azimuths))
     skip = int(np.ceil(_SKIP_SECONDS * described["itd_frameRate"]))
     powers = np.zeros(2)  # of the sounds, and of their ratemaps
-    for azimuth, sound in _ahead(sounds):
+    for sound, azimuth, reverberant in _ahead(sounds):
         scaled = sound * _LEVEL
         features = process(scaled, sample_rate, parameters=values, outputs=list(cues.KINDS))
         quantized = cues.quantize(features, cues.scaling_db(values), max_itd)
         late = azimuth is None
         direction = None if late else int(np.abs(angles.difference(azimuths, azimuth)).argmin())
-        histograms.add(direction, quantized.select(slice(skip, None)))
+        histograms.add(direction, quantized.select(slice(skip, None)), reverberant)
         if late:
             continue
         powers += np.mean(scaled**2), features["ratemap"].sum(axis=(0, 1)).mean()
-    for sound in hum_sounds(sample_rate):
-        features = process(sound * _LEVEL, sample_rate, parameters=values, outputs=list(cues.KINDS))
+    for hum in hum_sounds(sample_rate):
+        features = process(hum * _LEVEL, sample_rate, parameters=values, outputs=list(cues.KINDS))
         histograms.add_hum(cues.quantize(features, cues.scaling_db(values), max_itd).select(slice(skip, None)))
     return histograms, {
         "sample_rate": sample_rate,
@@ -153,7 +163,7 @@ def count(
     }
 
 
-def _ahead(sounds: Iterable[tuple[float | None, FloatArray]]) -> Iterator[tuple[float | None, FloatArray]]:
+def _ahead(sounds: Iterable[Sound]) -> Iterator[Sound]:
     """Yield sounds, of which another thread computes the next one in the meantime."""
     source = iter(sounds)
     with ThreadPoolExecutor(1) as worker:

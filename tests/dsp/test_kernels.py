@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import subprocess
 import threading
@@ -23,7 +24,7 @@ from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.dsp.windows import NAMES
 from rosafe.localization import cues, mixture
-from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.direction_model import TABLES, DirectionModel
 from rosafe.localization.evidence import EvidenceWindow
 from rosafe.representations import STAGES, precedence
 from rosafe.representations.amsfeatures import AmsFeatures
@@ -550,7 +551,7 @@ def direction_model(channels: int, rng: np.random.Generator) -> DirectionModel:
         "level_gain_db": 0.0,
     }
     rows = channels * cues.CLASSES
-    tables = [rng.normal(0, 1, (rows * bins + 1, kernels.DIRECTIONS + 1)) for bins in (cues.ITD_BINS, cues.ILD_BINS)]
+    tables = [rng.normal(0, 1, (rows * bins + 1, kernels.DIRECTIONS + 1)) for bins in TABLES.values()]
     for table in tables:
         table[-1] = 0.0
     return DirectionModel(description, *tables)
@@ -583,7 +584,8 @@ def test_evidence(yaw: float | None, level: Choice) -> None:
         for window, choice in zip(both, (level, NUMPY), strict=True):
             with using(choice):
                 window.extend(new, np.ones(frames), turned)
-                results.append((window.sums(), *window.units(20, np.full(5, -40.0))))
+                units = (window.units(20, np.full(5, -40.0), tables) for tables in (model.rooms, model.dry))
+                results.append((window.sums(), *itertools.chain(*units)))
         for got, expected in zip(*results, strict=True):
             np.testing.assert_array_equal(got, expected)
     assert np.abs(both[0].sums()).max() > 1

@@ -7,7 +7,7 @@ import pytest
 
 from rosafe.localization import angles
 from rosafe.localization.cues import CLASSES, ILD_BINS, ITD_BINS, LEVEL_CLASSES, Cues, floors
-from rosafe.localization.direction_model import DirectionModel, Histograms
+from rosafe.localization.direction_model import TABLES, DirectionModel, Histograms
 from rosafe.localization.evidence import EvidenceWindow, rotate
 
 CHANNELS, LENGTH, FRAMES = 3, 40, 170
@@ -32,7 +32,7 @@ def model() -> DirectionModel:
         "max_itd": 1e-3,
         "level_gain_db": 0.0,
     }
-    tables = [RANDOM.standard_normal((rows * bins + 1, len(angles.grid()) + 1)) for bins in (ITD_BINS, ILD_BINS)]
+    tables = [RANDOM.standard_normal((rows * bins + 1, len(angles.grid()) + 1)) for bins in TABLES.values()]
     for table in tables:
         table[-1] = 0.0  # of frames without cues
     return DirectionModel(description, *tables)
@@ -76,9 +76,13 @@ def test_units_are_compared_with_reverberation(model: DirectionModel) -> None:
     itd, ild = (rows[valid] for rows in model.rows(found.select(frames), floor))
     for exponent in (1.0, 0.0):
         terms = model.terms(itd, ild) if exponent else model.unweighted_terms(itd, ild)
-        units = model.unit_evidence(found, floor, frames, exponent)
+        units = model.unit_evidence(model.rooms, found, floor, frames, exponent)
         late = terms - units
         assert np.ptp(late, axis=1).max() < 1e-4 * np.abs(terms).max() and np.abs(late).mean() > 0.1
+        dry, compared = (
+            model.unit_evidence(tables, found, floor, frames, exponent) for tables in (model.dry, model.dry_or_late)
+        )
+        assert np.ptp(dry - compared, axis=1).max() < 1e-4 * np.abs(dry).max() < np.abs(dry - units).max()
 
 
 def test_reverberation_does_not_change_the_tables_of_directions() -> None:
@@ -86,13 +90,30 @@ def test_reverberation_does_not_change_the_tables_of_directions() -> None:
     histograms = Histograms(CHANNELS, 2)
     frequencies = np.linspace(100.0, 4000.0, CHANNELS)
     histograms.add(0, random_cues())
-    histograms.add(1, random_cues())
+    histograms.add(1, random_cues(), in_room=True)
     before = histograms.tables(frequencies)
     assert all(np.abs(table[:, -1]).max() < 1e-4 for table in before)  # that of the mean
     histograms.add(None, random_cues())
     for table, without in zip(histograms.tables(frequencies), before, strict=True):
         np.testing.assert_array_equal(table[:, :-1], without[:, :-1])
         assert np.abs(table[:-1, -1]).mean() > 0.01
+
+
+def test_half_of_the_dry_tables_is_of_sounds_without_a_room() -> None:
+    first, second = random_cues(), random_cues()
+    frequencies = np.linspace(100.0, 4000.0, CHANNELS)
+
+    def tables(*sounds: tuple[Cues, bool]) -> list[np.ndarray]:
+        histograms = Histograms(CHANNELS, 2)
+        for found, in_room in sounds:
+            histograms.add(0, found, in_room)
+            histograms.add(1, found._replace(level=found.level[::-1]), in_room)
+        return histograms.tables(frequencies)
+
+    alone, both = tables((first, False)), tables((first, False), (second, True))
+    for found, dry, all_ in zip(both[2:], alone[:2], both[:2], strict=True):
+        np.testing.assert_allclose(found, (dry + all_) / 2, atol=1e-6)
+    assert np.abs(both[0] - alone[0]).max() > 0.01
 
 
 @pytest.mark.parametrize("phase", range(10))

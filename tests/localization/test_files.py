@@ -21,7 +21,7 @@ import pytest
 import rosafe
 from rosafe.localization import angles, cues, model_cache
 from rosafe.localization import stored_noise as noise
-from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.direction_model import TABLES, DirectionModel
 from rosafe.system import trust
 from tests.harness import PYTHON, ROOT
 from tests.localization.test_head import write_sofa
@@ -143,7 +143,7 @@ def _inflating_model(path: Path, channels: int = 128) -> None:
 def _absurd_shape(path: Path) -> None:
     header = b"{'descr': '<f2', 'fortran_order': False, 'shape': (1000000000000, 73), }"
     with zipfile.ZipFile(path, "w") as archive:
-        for name in ("description", "itd_table", "ild_table"):
+        for name in ("description", *TABLES):
             archive.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
 
 
@@ -213,7 +213,7 @@ def small_model(parameters: dict[str, Any], head: str = "a head") -> dict[str, n
     """Return the arrays of a model of 8 kHz whose directions are equally likely."""
     described = cues.describe(8000.0, parameters)
     values = {
-        "format": "rosafe direction model 2",
+        "format": "rosafe direction model 3",
         "sample_rate": 8000.0,
         "parameters": cues.model_parameters(described),
         "head": head,
@@ -222,10 +222,7 @@ def small_model(parameters: dict[str, Any], head: str = "a head") -> dict[str, n
         "level_gain_db": 1.5,
     }
     rows = len(described["fb_cfHz"]) * cues.CLASSES
-    tables = {
-        name: np.zeros((rows * bins + 1, len(angles.grid()) + 1), np.float16)
-        for name, bins in (("itd_table", cues.ITD_BINS), ("ild_table", cues.ILD_BINS))
-    }
+    tables = {name: np.zeros((rows * bins + 1, len(angles.grid()) + 1), np.float16) for name, bins in TABLES.items()}
     return {"description": np.array(json.dumps(values)), **tables}
 
 

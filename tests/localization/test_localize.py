@@ -13,7 +13,7 @@ import pytest
 import rosafe
 from rosafe.localization import cues, model_cache, training
 from rosafe.localization.cues import KINDS
-from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.direction_model import TABLES, DirectionModel
 from rosafe.localization.localize import clipped_samples
 from tests.localization.conftest import RATE, modulated
 
@@ -270,7 +270,7 @@ def test_the_memory_order_of_the_tables_does_not_matter(sphere_model: Path) -> N
     model = DirectionModel.load(sphere_model)
     description = {**vars(model), "parameters": model.parameters}
     with np.load(sphere_model) as file:
-        other = DirectionModel(description, *(np.asfortranarray(file[name]) for name in ("itd_table", "ild_table")))
+        other = DirectionModel(description, *(np.asfortranarray(file[name]) for name in TABLES))
     assert other.itd_table.flags.c_contiguous and other.ild_table.flags.c_contiguous
     sound = rosafe.Head.sphere().render(modulated(0.3, 2), RATE, 30)
     _equal(rosafe.localize(sound, RATE, model), rosafe.localize(sound, RATE, other))  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ import scipy.signal
 
 from rosafe.localization.head import Head
 from rosafe.localization.localize import localize
+from rosafe.localization.localizer import Localizer
 from rosafe.localization.rooms import reverberant_filters
 from tests.localization.conftest import modulated
 
@@ -67,3 +68,21 @@ def test_directions_in_rooms(kemar: Head, kemar_model: Path) -> None:
         found = localize(sound, RATE, kemar_model, 1.0)
         right.append(abs(found["azimuth"][-1] - azimuth) <= 5)
     assert np.mean(right) >= 0.7
+
+
+@pytest.mark.parametrize("drr_db", [5.0, 0.0])
+def test_a_room_is_noticed_and_its_absence(kemar: Head, kemar_model: Path, drr_db: float) -> None:
+    """The decision lasts from the first second on, also in noise, and a room that begins ends it."""
+    dry = modulated(4.0, 3)
+    direct = kemar.render(dry, RATE, 40.0)
+    noise = np.random.default_rng(4).standard_normal(direct.shape) * np.std(direct) * 10 ** (-15 / 20)
+    response = reverberant_filters(kemar, 40.0, RATE, 0.4, drr_db, np.random.default_rng(2))
+    room = scipy.signal.oaconvolve(dry[np.newaxis], response, axes=1)[:, : len(dry)]
+    localizer = Localizer(RATE, kemar_model)
+    decisions = []
+    for sound in (direct + noise, room + noise, direct + noise):
+        for begin in range(0, sound.shape[1], RATE // 10):
+            localizer.process(sound[:, begin : begin + RATE // 10])
+            decisions.append(localizer._surroundings.dry)
+    first, second, third = (decisions[begin : begin + 40] for begin in (0, 40, 80))
+    assert all(first[12:]) and not any(second[12:]) and all(third[22:]), decisions

@@ -20,7 +20,7 @@ import rosafe
 import rosafe.plugin
 from rosafe.interface import KINDS
 from rosafe.localization import cues, model_cache
-from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.direction_model import TABLES, DirectionModel
 from rosafe.localization.scene import SceneRenderer
 from rosafe.localization.scene_file import read_scene
 from rosafe.representations import STAGES
@@ -80,7 +80,7 @@ def _model() -> DirectionModel:
     """Return a model with random tables."""
     described = rosafe.Stream(RATE, {"fb_nChannels": 4}, list(cues.KINDS)).describe()
     rows, random = 4 * cues.CLASSES, np.random.default_rng(4)
-    tables = [random.standard_normal((rows * bins + 1, 73)) / 4 for bins in (cues.ITD_BINS, cues.ILD_BINS)]
+    tables = [random.standard_normal((rows * bins + 1, 73)) / 4 for bins in TABLES.values()]
     about = {
         "sample_rate": RATE,
         "parameters": described["parameters"],
