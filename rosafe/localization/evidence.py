@@ -13,7 +13,7 @@ from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.localization import angles
 from rosafe.localization.cues import Cues, floors
 from rosafe.localization.direction_model import UNIT_WEIGHT, DirectionModel
-from rosafe.localization.mixture import Units
+from rosafe.localization.mixture import DECISION_STEP, Surroundings, Units
 
 
 class EvidenceWindow:
@@ -31,6 +31,7 @@ class EvidenceWindow:
     """
 
     def __init__(self, model: DirectionModel, frames: int) -> None:
+        self.surroundings = Surroundings()
         self._model = model
         self._frames = frames
         channels = model.channels
@@ -130,8 +131,15 @@ class EvidenceWindow:
         yaw = self._yaw[places]
         return rotate(evidence, np.broadcast_to(yaw[:, np.newaxis], valid.shape)[valid]) if yaw.any() else evidence
 
-    def units(self, frames: int, noise: FloatArray, tables: EvidenceTables) -> Units:
-        """Return the channels with cues of the last `frames` frames, in world coordinates; `noise` (C,) is in dB."""
+    def units(self, frames: int, noise: FloatArray) -> Units:
+        """Return the channels with cues of the last `frames` frames, in world coordinates; `noise` (C,) is in dB.
+
+        Their tables are those of the surroundings, which are decided before.
+        """
+        model = self._model
+        both = (self.unit_evidence(frames, one, step=DECISION_STEP) for one in (model.rooms, model.dry_or_late))
+        self.surroundings.update(*both)
+        tables = model.dry if self.surroundings.dry else model.rooms
         places = self._last(frames)
         valid = self._cues.valid[places]
         return Units(

@@ -17,7 +17,7 @@ from rosafe.localization import angles, cues
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.evidence import EvidenceWindow
 from rosafe.localization.head import Head, checked_rate, computed_head
-from rosafe.localization.mixture import DECISION_STEP, DRY_SHARPNESS, Surroundings, candidates
+from rosafe.localization.mixture import DRY_SHARPNESS, candidates
 from rosafe.localization.model_cache import model_of
 from rosafe.localization.noise import SteadyNoise
 from rosafe.localization.posterior import Estimate, Estimator
@@ -108,7 +108,6 @@ class Localizer(OwnState):
     def _start(self) -> None:
         self._evidence = EvidenceWindow(self.model, self._frames)
         self._tracker = Tracker(self._keep_history)
-        self._surroundings = Surroundings()
         self._count = 0
 
     def reset(self, keep_noise: bool = False) -> None:
@@ -232,11 +231,8 @@ class Localizer(OwnState):
     def _update_tracks(self, time: float, yaw: float) -> None:
         window = self._evidence
         self.noise.update(window.lowest_level(self._update_frames))
-        frames, model, surroundings = self._track_frames, self.model, self._surroundings
-        both = (window.unit_evidence(frames, one, step=DECISION_STEP) for one in (model.rooms, model.dry_or_late))
-        surroundings.update(*both)
-        units = window.units(frames, self.noise.threshold, model.dry if surroundings.dry else model.rooms)
-        found = candidates(units, yaw, DRY_SHARPNESS if surroundings.dry else 1.0)
+        units = window.units(self._track_frames, self.noise.threshold)
+        found = candidates(units, yaw, DRY_SHARPNESS if window.surroundings.dry else 1.0)
         found = self.noise.remove_from(found, time, yaw)
         self._tracker.update(found, time, yaw)
 

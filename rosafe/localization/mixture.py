@@ -26,9 +26,9 @@ MIN_SALIENCE = 0.19  # part of the evidence for a source that is above the noise
 MIN_REST = 0.4  # of the evidence, with which that of a source is compared if the rest is noise
 MAX_CANDIDATES = 6
 SEPARATION = 15.0  # degrees between two candidates, at least
-# Mean ratio of the logarithmic likelihoods of units without a room and in rooms, relative to those in rooms, above which
-# the sound comes without a room, and below which not any more. Talkers without a room have -0.02 to 0.05, those at
-# a direct-to-reverberant ratio of 5 dB at most -0.13, steady noise there -0.16 to -0.01.
+# Mean difference of the logarithmic likelihoods of units without a room and in rooms, relative to those in rooms, above
+# which the sound comes without a room, and below which not any more. Talkers without a room have -0.02 to 0.05, those
+# at a direct-to-reverberant ratio of 5 dB at most -0.13, sounds with few pauses there -0.16 to -0.01.
 _DRY, _NOT_DRY = -0.02, -0.03
 _FIRST = (
     -0.2
@@ -112,7 +112,7 @@ class Surroundings:
         self._ratio, self._evidence = _FIRST, 0.0
 
     def update(self, rooms: NDArray[np.float32], dry: NDArray[np.float32]) -> None:
-        """Take the evidence (U, A) of the same units by the tables for rooms and for none, relative to reverberation."""
+        """Take the evidence (U, A) of the same units, in rooms and without, both relative to reverberation."""
         if len(rooms) >= MIN_UNITS // DECISION_STEP:
             in_room, without = (-np.log(fit(evidence).inverse) for evidence in (rooms, dry))
             mean = max(float(np.mean(np.abs(in_room))), _EQUAL)

@@ -584,8 +584,8 @@ def test_evidence(yaw: float | None, level: Choice) -> None:
         for window, choice in zip(both, (level, NUMPY), strict=True):
             with using(choice):
                 window.extend(new, np.ones(frames), turned)
-                units = (window.units(20, np.full(5, -40.0), tables) for tables in (model.rooms, model.dry))
-                results.append((window.sums(), *itertools.chain(*units)))
+                dry = (window.unit_evidence(20, model.dry, step=step) for step in (1, 3))
+                results.append((window.sums(), *window.units(20, np.full(5, -40.0)), *dry))
         for got, expected in zip(*results, strict=True):
             np.testing.assert_array_equal(got, expected)
     assert np.abs(both[0].sums()).max() > 1

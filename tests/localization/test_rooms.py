@@ -83,6 +83,6 @@ def test_a_room_is_noticed_and_its_absence(kemar: Head, kemar_model: Path, drr_d
     for sound in (direct + noise, room + noise, direct + noise):
         for begin in range(0, sound.shape[1], RATE // 10):
             localizer.process(sound[:, begin : begin + RATE // 10])
-            decisions.append(localizer._surroundings.dry)
+            decisions.append(localizer._evidence.surroundings.dry)
     first, second, third = (decisions[begin : begin + 40] for begin in (0, 40, 80))
     assert all(first[12:]) and not any(second[12:]) and all(third[22:]), decisions
