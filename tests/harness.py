@@ -140,7 +140,7 @@ def run_program(command: Sequence[str | Path], **options: Any) -> subprocess.Com
 
 
 def in_loop(context: Callable[..., AbstractAsyncContextManager[Any]], *arguments: Any) -> Callable[[Any], Any]:
-    """Decorate a test that is a coroutine. Its positional-only arguments are what `context(*arguments)` yields."""
+    """Decorate a test that is a coroutine. `context(*arguments)` yields its positional-only arguments."""
 
     def decorate(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
         async def limited(fixtures: dict[str, Any]) -> None:

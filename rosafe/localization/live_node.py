@@ -1,4 +1,4 @@
-"""What the localizer nodes of ROS 1 and ROS 2 have in common, without ROS: the content of topics, and the parts."""
+"""The common part of the localizer nodes of ROS 1 and ROS 2, without ROS: content of topics, localization, streams."""
 
 from __future__ import annotations
 

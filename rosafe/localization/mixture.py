@@ -104,7 +104,7 @@ class Surroundings:
     Attributes
     ----------
     dry : bool
-        Whether there is no room, or little reverberation.
+        Whether the sound comes without a room, or with little reverberation, and its cues are clear.
     """
 
     def __init__(self) -> None:

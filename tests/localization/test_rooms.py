@@ -86,3 +86,16 @@ def test_a_room_is_noticed_and_its_absence(kemar: Head, kemar_model: Path, drr_d
             decisions.append(localizer._evidence.surroundings.dry)
     first, second, third = (decisions[begin : begin + 40] for begin in (0, 40, 80))
     assert all(first[12:]) and not any(second[12:]) and all(third[22:]), decisions
+
+
+def test_noise_has_the_tables_of_rooms(kemar: Head, kemar_model: Path) -> None:
+    """The factor of the evidence without a room would make sources of noise that is as loud as the source."""
+    direct = kemar.render(modulated(4.0, 3), RATE, 40.0)
+    localizer = Localizer(RATE, kemar_model)
+    decisions = []
+    for ratio_db in (20, 0):
+        noise = np.random.default_rng(4).standard_normal(direct.shape) * np.std(direct) * 10 ** (-ratio_db / 20)
+        for begin in range(0, direct.shape[1], RATE // 10):
+            localizer.process((direct + noise)[:, begin : begin + RATE // 10])
+            decisions.append(localizer._evidence.surroundings.dry)
+    assert all(decisions[12:40]) and not any(decisions[60:]), decisions

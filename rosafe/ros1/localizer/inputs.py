@@ -1,4 +1,4 @@
-"""What the localizer receives from rosAFE: new frames of the four ports that it needs, and the sound of the input."""
+"""The data that the localizer receives from rosAFE: new frames of its four ports, and the sound of the input."""
 
 from __future__ import annotations
 

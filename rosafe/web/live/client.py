@@ -1,6 +1,6 @@
 """The WebSocket of one page: requests, answers, state messages, and the views that it has subscribed to.
 
-All messages are limited to what the page can take.
+All messages are limited to the rate that the page can receive.
 """
 
 from __future__ import annotations
