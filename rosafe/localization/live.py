@@ -620,28 +620,29 @@ class LocalizationLoop:
                 self._begin_again()
         self._queue.append(new)
 
-    def _check_silence(self) -> None:
-        """Forget the sources if no frames were used for too long."""
+    def _check_frames(self) -> bool:
+        """Return whether sources are known: frames were used lately. The next ones tell whether sound was lost."""
         now = time.monotonic()
         source = self._source
         if source is None:
-            return
-        limit = self._limit(source)
-        if self._newest and (self._queue.muted or now - self._queue.used_at > limit):
+            return False
+        if self._newest and self._queue.muted:
             self._begin_again()
+        limit = self._limit(source)
         if now - self._queue.received_at <= limit:
             self._status.clear("frames")
         elif not source.problem:
             self._status.set("frames", WARN, f"waiting for {source.missing}")
+        return bool(self._newest) and now - self._queue.used_at <= limit
 
     def _publish(self) -> bool:
         """Publish the state; return True."""
-        self._check_silence()
+        known = self._check_frames()
         localizer = self._localizer
-        sources = localizer.sources if localizer is not None and self._newest and not self._queue.muted else []
+        sources = localizer.sources if localizer is not None and known else []
         gain_db = localizer.model.level_gain_db if localizer is not None else 0.0
-        stamp = self._newest or self._clock()
-        self._publishing.publish(stamp, sources, gain_db, self._estimate)
+        estimate = self._estimate if known else (self._estimate[0], uniform(self._estimate[0]))
+        self._publishing.publish(self._newest if known else self._clock(), sources, gain_db, estimate)
         return True
 
 

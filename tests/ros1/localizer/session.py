@@ -127,6 +127,15 @@ def acquire(graph: Graph, device: str, chunk: int = 800, rate: int = 0) -> None:
     assert response.genom_success, response.genom_exdetail
 
 
+def wait_played(bass: Process, path: Path, sources: list[Any]) -> None:
+    """Wait for the end of a file, and until a second of messages on ~sources without a source has followed it."""
+    wait_for(lambda: f"file:{path}: end of the source" in bass.err, what=lambda: f"the end of {path}: {bass}")
+    ended = len(sources)
+    wait_for(
+        lambda: len(sources) >= ended + 10 and not any(message.sources for message in sources[-10:]), what="silence"
+    )
+
+
 def names_of(graph: Graph, node: str = "rosAFE") -> set[str]:
     """Return the names of all processors."""
     return {processor.name for processor in graph.call(f"/{node}/getProcessors").processors}

@@ -1,4 +1,4 @@
-"""Ten minutes of silence between two sounds, without waiting for them."""
+"""Ten minutes of silence between two sounds, without waiting for them; a machine that is busy."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ class Robot:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, head: Path) -> None:
         self.index = 0
+        self.late = 0.0  # s since the end of the newest block
         self.published: list[tuple[float, list[float]]] = []  # stamp and azimuths of present sources
-        clock: Any = SimpleNamespace(monotonic=lambda: self.index / RATE)
+        clock: Any = SimpleNamespace(monotonic=lambda: self.index / RATE + self.late)
         monkeypatch.setattr(live, "time", clock)
         monkeypatch.setattr(rospy, "Subscriber", lambda *_, **__: SimpleNamespace(unregister=lambda: None))
         frame_clock: Any = SimpleNamespace(
@@ -42,7 +43,8 @@ class Robot:
             missing="sound",
             time=lambda frame: SimpleNamespace(ros=rospy.Time.from_sec(START + frame / RATE)),
         )
-        publishers: Any = SimpleNamespace(begin_again=lambda: None, publish=self._publish)
+        self.begun = 0  # how often localization began again
+        publishers: Any = SimpleNamespace(begin_again=self._begin_again, publish=self._publish)
         mute: Any = SimpleNamespace(active=False, muted=lambda times: np.zeros(len(times), bool))
         self.status = node_status(lambda: None)
         self.loop = LocalizationLoop(
@@ -51,7 +53,7 @@ class Robot:
             FrameQueue(FixedHead(), mute),
             self.status,
             lambda: None,
-            lambda: START + self.index / RATE,
+            lambda: START + self.index / RATE + self.late,
         )
         model = Localizer(RATE, str(head)).model
         window, hop = (round(model.parameters[f"cc_{name}"] * RATE) for name in ("wSizeSec", "hSizeSec"))
@@ -59,6 +61,9 @@ class Robot:
         topics = dict.fromkeys(cues.KINDS, "")
         self.loop.connect(model, partial(PortSource, topics, frame_format, frame_clock))
         self._stream = Stream(RATE, model.parameters, list(cues.KINDS))
+
+    def _begin_again(self) -> None:
+        self.begun += 1
 
     def _publish(self, time: float, tracks: Any, *_: Any) -> None:
         present = [track.azimuth for track in tracks if track.id and track.probability > 0.5]
@@ -118,3 +123,23 @@ def test_long_silence(monkeypatch: pytest.MonkeyPatch, sphere_model: Path) -> No
     robot.hear(talker)
     assert any(abs(azimuth - 40) < 10 for azimuth in robot.published[-1][1])
     assert robot.status.state()[0] == OK and "lost frames" not in robot.status._values
+
+
+def test_blocks_that_are_late_change_no_source(monkeypatch: pytest.MonkeyPatch, sphere_model: Path) -> None:
+    """Until they arrive, no source is published. Localization begins again only if sound is missing."""
+    robot = Robot(monkeypatch, sphere_model)
+    talker = Head.sphere().render(modulated(4.0, 3), RATE, azimuth=40.0)
+    robot.hear(talker)
+    before, begun = robot.loop._localizer, robot.begun
+    assert before is not None and robot.published[-1][1]
+    ids = [track.id for track in before.sources]
+    robot.late = 5.0
+    robot.loop._attempt(robot.loop._publish)
+    assert robot.published[-1] == (START + robot.index / RATE + 5.0, [])
+    robot.hear(talker[:, :BLOCK])
+    robot.late = 0.0
+    robot.loop._attempt(robot.loop._publish)
+    assert robot.published[-1][1] and [track.id for track in before.sources] == ids and robot.begun == begun
+    robot.index += 3 * BLOCK
+    robot.hear(talker)
+    assert robot.begun > begun

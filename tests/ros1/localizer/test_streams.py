@@ -6,7 +6,6 @@ import contextlib
 import importlib
 import math
 import signal
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -25,7 +24,7 @@ from tests.localization.conftest import MUSIC, TALKER, take
 from tests.localization.sounds import assert_crossed, crossing
 from tests.localization.test_enhancement import si_sdr
 from tests.ros1.localizer.conftest import RATE
-from tests.ros1.localizer.session import Localizer, acquire, running_localizer
+from tests.ros1.localizer.session import Localizer, acquire, running_localizer, wait_played
 from tests.streams import Part, ids_of_file
 
 __all__ = ["take"]
@@ -47,13 +46,13 @@ rospy.spin()
 
 @pytest.fixture
 def run(
-    graph: Graph, localizer: Localizer, take: tuple[Path, np.ndarray], sphere_model: Path
+    graph: Graph, bass: Process, localizer: Localizer, take: tuple[Path, np.ndarray]
 ) -> tuple[list[Any], list[Any]]:
     """Play the recording; return the messages on ~streams and ~sources."""
     audio_class = importlib.import_module("rosAFE.msg").SourceAudio
     with graph.collect("/localizer/streams", audio_class) as parts, localizer.collect() as sources:
         acquire(graph, f"file:{take[0]}")
-        wait_for(lambda: parts and parts[-1].header.stamp.to_sec() + 1.5 < time.time(), what="the end of the streams")
+        wait_played(bass, take[0], sources)
         return list(parts), list(sources)
 
 
@@ -72,7 +71,7 @@ def test_streams_are_those_of_the_file(
 
 
 def test_sources_come_and_go_and_a_slow_and_a_late_subscriber(
-    graph: Graph, localizer: Localizer, take: tuple[Path, np.ndarray], tmp_path: Path
+    graph: Graph, bass: Process, localizer: Localizer, take: tuple[Path, np.ndarray], tmp_path: Path
 ) -> None:
     """The talker stops after 3 s, and the music begins after 2.5 s."""
     parts = take[1].copy()
@@ -81,11 +80,15 @@ def test_sources_come_and_go_and_a_slow_and_a_late_subscriber(
     path = tmp_path / "come.wav"
     soundfile.write(path, parts.sum(axis=0).T, RATE, subtype="PCM_32")
     audio_class = importlib.import_module("rosAFE.msg").SourceAudio
-    with graph.collect("/localizer/streams", audio_class) as received, graph.start(PYTHON, "-c", SLOW) as slow:
+    with (
+        graph.collect("/localizer/streams", audio_class) as received,
+        localizer.collect() as sources,
+        graph.start(PYTHON, "-c", SLOW) as slow,
+    ):
         acquire(graph, f"file:{path}")
         wait_for(lambda: any(abs(math.degrees(m.azimuth) - MUSIC) < 10 for m in received), what="the music")
         with graph.collect("/localizer/streams", audio_class) as late:
-            wait_for(lambda: received[-1].header.stamp.to_sec() + 1.5 < time.time(), what="the end of the streams")
+            wait_played(bass, path, sources)
         messages = list(received)
         lines = [[int(word) for word in line.split()] for line in slow.out.splitlines()]
     talker, tune = (
@@ -143,13 +146,16 @@ def test_markers_are_filled_for_sources_that_speak() -> None:
 
 
 @pytest.mark.exploration
-def test_voices_that_cross_keep_their_ids(graph: Graph, localizer: Localizer, take: Any, tmp_path: Path) -> None:
+def test_voices_that_cross_keep_their_ids(
+    graph: Graph, bass: Process, localizer: Localizer, take: Any, tmp_path: Path
+) -> None:
     """A talker moves past the music, which stays."""
-    truths = crossing(take[1], tmp_path / "cross.wav")
+    path = tmp_path / "cross.wav"
+    truths = crossing(take[1], path)
     audio_class = importlib.import_module("rosAFE.msg").SourceAudio
-    with graph.collect("/localizer/streams", audio_class) as received:
-        acquire(graph, f"file:{tmp_path / 'cross.wav'}")
-        wait_for(lambda: received and received[-1].header.stamp.to_sec() + 1.5 < time.time(), what="the end")
+    with graph.collect("/localizer/streams", audio_class) as received, localizer.collect() as sources:
+        acquire(graph, f"file:{path}")
+        wait_played(bass, path, sources)
         messages = list(received)
     assert_crossed([(m.id, m.header.stamp.to_sec(), m.first_sample, m.samples) for m in messages], truths)
 
