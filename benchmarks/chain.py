@@ -25,6 +25,7 @@ for library in ("OMP", "OPENBLAS", "MKL"):  # before the import of numpy, so tha
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE)]
 
+import arithmetic  # noqa: E402
 import configurations  # noqa: E402
 import kinds  # noqa: E402
 import numpy as np  # noqa: E402
@@ -248,8 +249,25 @@ def _say_stages(page: report.Report, rounds: int) -> None:
         page.say(f"## Stage by stage on one core, blocks of {block}")
         page.say()
         found = in_new_process(one_core, block, rounds)
+        if block == BLOCKS[1]:
+            blockwise = found
         rows = [[k, f"{t['reference']:.2f}", f"{t['rosafe']:.2f}", f"{t['ratio']:.1f}"] for k, t in found.items()]
         page.table(["stage", "reference", "rosafe", "times as fast"], rows)
+    if kernels.status().compiled:
+        _say_limits(page, blockwise, rounds)
+
+
+def _say_limits(page: report.Report, found: dict[str, Any], rounds: int) -> None:
+    """Compare the times of the stages with the limit of their arithmetic."""
+    limits = in_new_process(arithmetic.limits, RATE, rounds)
+    page.say(f"## Limit of the arithmetic on one core, blocks of {BLOCKS[1]}")
+    page.say()
+    page.say("The products and sums of each stage, at the rate of fused products that the same core was measured to")
+    page.say("execute without access to memory. Cores that compute sums beside fused products can be faster.")
+    page.say()
+    limits["chain"] = sum(limits.values())
+    rows = [[k, f"{ms:.2f}", f"{found[k]['rosafe']:.2f}", f"{ms / found[k]['rosafe']:.2f}"] for k, ms in limits.items()]
+    page.table(["stage", "limit", "rosafe", "limit over rosafe"], rows)
 
 
 def _say_tree(page: report.Report, rounds: int) -> None:
