@@ -226,6 +226,7 @@ class Process:
         """End the process and its children, with SIGKILL if SIGTERM has no effect."""
         if self.alive:
             self._signal_group(signal.SIGTERM)
+            self._signal_group(signal.SIGCONT)  # a test may have stopped it
             try:
                 self._popen.wait(GRACE)
             except subprocess.TimeoutExpired:
