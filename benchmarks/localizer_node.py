@@ -81,6 +81,7 @@ def measure() -> dict[str, float]:
     received: list[tuple[float, object]] = []
     truths: list[object] = []
     with tempfile.TemporaryDirectory() as folder, graph.bench() as bench:
+        from geometry_msgs.msg import PoseArray
         from rosAFE.msg import SoundSources
 
         from bass.msg import SceneTruth
@@ -92,7 +93,8 @@ def measure() -> dict[str, float]:
         begin = processor_seconds(afe)
         time.sleep(SETTLE_SECONDS)
         idle = (processor_seconds(afe) - begin) / SETTLE_SECONDS
-        rospy.Subscriber("/localizer/sources", SoundSources, lambda m: received.append((rospy.get_time(), m)))
+        topic = "/localizer/sources"
+        sources = rospy.Subscriber(topic, SoundSources, lambda m: received.append((rospy.get_time(), m)))
         rospy.Subscriber("/bass/sceneTruth", SceneTruth, truths.append)
         node = bench.start("rosafe", "localize")
         bench.session.wait(
@@ -110,9 +112,19 @@ def measure() -> dict[str, float]:
         messages = list(received)
         latency = [now - m.header.stamp.to_sec() for now, m in messages if m.sources]
         delays = onset_delays(list(truths), [m for _, m in messages])
+        rospy.Subscriber("/localizer/poses", PoseArray, lambda message: None)
+        sources.unregister()
+        bench.call(
+            "/bass/Acquire", device=f"scene:{scene}", sampleRate=graph.RATE, nFramesPerChunk=2205, nChunksOnPort=20
+        )
+        time.sleep(SETTLE_SECONDS)
+        begin = processor_seconds(node.process.pid)
+        time.sleep(SECONDS - SETTLE_SECONDS)
+        without_speech = (processor_seconds(node.process.pid) - begin) / (SECONDS - SETTLE_SECONDS)
     return {
         "messages per second": len(messages) / SECONDS,
         "processor time of the localizer, % of a core": 100 * used["localizer"],
+        "the same without speech, which only ~poses does not need": 100 * without_speech,
         "additional processor time of rosAFE, % of a core": 100 * (used["rosAFE"] - idle),
         "publication - header.stamp, median, ms": 1000 * float(np.median(latency)),
         "publication - header.stamp, 99 %, ms": 1000 * float(np.percentile(latency, 99)),

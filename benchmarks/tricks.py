@@ -152,9 +152,9 @@ OPTIMISATIONS = (
         stage="precedence",
     ),
     Optimisation(
-        "gabor: two registers of frames share a weight",
+        "gabor: four registers of frames, two of each ear, share a weight, instead of two",
         "gabor.c",
-        (("TOGETHER = 2", "TOGETHER = 1"),),
+        (("TOGETHER = 4", "TOGETHER = 2"),),
         blocks=441 * 100,
         stage="gabor",
     ),

@@ -82,3 +82,13 @@ def test_listed_benchmarks_are_those_of_the_document() -> None:
     listed = re.findall(r"benchmarks/(\w+\.py) ", benchmark("all", "--list").stdout)
     rows = re.findall(r"^\| (`benchmarks/.*?) \|", (ROOT / "docs" / "speed.md").read_text("utf-8"), re.MULTILINE)
     assert sorted(listed) == sorted(re.findall(r"benchmarks/(\w+\.py)", " ".join(rows)))
+
+
+def test_optimisations_are_in_the_sources(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each can be removed by replacing text."""
+    monkeypatch.setattr(sys, "path", [str(FOLDER), *sys.path])
+    import tricks  # type: ignore[import-not-found]
+
+    for one in tricks.OPTIMISATIONS:
+        source = (ROOT / "rosafe" / "dsp" / "kernels" / one.source).read_text("utf-8")
+        assert all(old in source for old, _ in one.without), one.text
