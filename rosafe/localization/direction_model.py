@@ -73,9 +73,9 @@ MAX_LOG_RATIO = 100.0
 class DirectionModel:
     """Log-likelihood ratios of cues for directions, relative to the mean over all directions.
 
-    For single units, as those of a mixture, they are relative to reverberation without its direct sound. Units of sound
-    without a room have other tables: means of these and of those that are learned from sounds without a room only. The
-    latter alone take front for back more often.
+    For single units, as those of a mixture, they are relative to reverberation without its direct sound. Sound without
+    a room has other tables: means of these and of those that are learned from sounds without a room only. The latter
+    alone take front for back more often.
 
     A model does not change; copies by `copy` are the model itself, which takes tens of megabytes.
 
@@ -146,34 +146,31 @@ class DirectionModel:
         ild_row = np.where(cues.valid, cues.ild_row + levels * ILD_BINS, len(self.ild_table) - 1)
         return itd_row, ild_row
 
-    def terms(self, itd_row: NDArray[np.intp], ild_row: NDArray[np.intp]) -> NDArray[np.float32]:
-        """Return weighted log-likelihood ratios (F, C, A) for the rows (F, C) of `rows`."""
-        return self.itd_table[itd_row] + self.ild_table[ild_row]
-
     def unweighted_terms(self, itd_row: NDArray[np.intp], ild_row: NDArray[np.intp]) -> NDArray[np.float32]:
-        """Return `terms` without the weights, which are for sums over frames and channels: those of each unit alone."""
+        """Return log-likelihood ratios (F, C, A) for the rows (F, C) of `rows`, without the weights of sums."""
         itd, ild = self._cue_weights
         return _unweighted(self.itd_table, itd_row, itd, ITD_BINS) + _unweighted(self.ild_table, ild_row, ild, ILD_BINS)
 
     def add_evidence(
         self,
         sums: FloatArray,
+        tables: kernels.EvidenceTables,
         cues: Cues,
         floor: FloatArray,
         frames: NDArray[np.intp],
         channels: NDArray[np.bool_],
         factor: float = 1.0,
     ) -> None:
-        """Add `terms` of some frames (n,) for some channels (C,), times `factor`, to `sums` (C, A).
+        """Add the log-likelihood ratios of some frames (n,) for some channels (C,), times `factor`, to `sums` (C, A).
 
-        Sums are exact: the tables have half precision.
+        Sums are exact: the model's `tables` have half precision.
         """
         if kernels.compiled():
-            self.rooms.add(sums, cues, floor, frames, channels, factor)
+            tables.add(sums, cues, floor, frames, channels, factor)
         else:
             itd_row, ild_row = (rows[:, channels] for rows in self.rows(cues.select(frames), floor))
-            itd = self.itd_table[itd_row].sum(axis=0, dtype=np.float64)
-            sums[channels] += factor * (itd + self.ild_table[ild_row].sum(axis=0, dtype=np.float64))
+            itd = tables.itd[itd_row].sum(axis=0, dtype=np.float64)
+            sums[channels] += factor * (itd + tables.ild[ild_row].sum(axis=0, dtype=np.float64))
 
     def unit_evidence(
         self,

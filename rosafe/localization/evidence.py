@@ -20,7 +20,8 @@ class EvidenceWindow:
     """Log-likelihood ratios of the last frames, summed over channels and frames.
 
     The floor of a channel is that of the whole window. If a floor changes, the evidence of its channel is computed
-    again for all frames of the window, so that a result depends on the sound in the window only.
+    again for all frames of the window, so that a result depends only on the sound in the window, and on whether it
+    comes from a room. If that changes, the evidence of all channels is computed again, with other tables.
 
     Parameters
     ----------
@@ -32,7 +33,7 @@ class EvidenceWindow:
 
     def __init__(self, model: DirectionModel, frames: int) -> None:
         self.surroundings = Surroundings()
-        self._model = model
+        self._model, self._tables = model, model.rooms
         self._frames = frames
         channels = model.channels
         self._cues = Cues(
@@ -84,14 +85,14 @@ class EvidenceWindow:
         """Add the evidence of frames for some channels (C,), times `factor`, to the sums in world coordinates."""
         yaw = self._yaw[frames]
         if not yaw.any():
-            self._model.add_evidence(self._sums, self._cues, self._floor, frames, channels, factor)
+            self._model.add_evidence(self._sums, self._tables, self._cues, self._floor, frames, channels, factor)
         elif (yaw == yaw[0]).all():
             total = np.zeros_like(self._sums)
-            self._model.add_evidence(total, self._cues, self._floor, frames, channels, factor)
+            self._model.add_evidence(total, self._tables, self._cues, self._floor, frames, channels, factor)
             self._sums[channels] += rotate(total, np.full(len(total), yaw[0]))[channels]
         else:
-            rows = self._model.rows(self._cues.select(frames), self._floor)
-            evidence = self._model.terms(*(row[:, channels] for row in rows))
+            itd_row, ild_row = (row[:, channels] for row in self._model.rows(self._cues.select(frames), self._floor))
+            evidence = self._tables.itd[itd_row] + self._tables.ild[ild_row]
             turned = rotate(evidence.reshape(-1, evidence.shape[-1]), np.repeat(yaw, evidence.shape[1]))
             self._sums[channels] += factor * turned.reshape(evidence.shape).sum(axis=0, dtype=np.float64)
 
@@ -139,6 +140,11 @@ class EvidenceWindow:
         model = self._model
         both = (self.unit_evidence(frames, one, step=DECISION_STEP) for one in (model.rooms, model.dry_or_late))
         self.surroundings.update(*both)
+        of_sums = model.rooms if self.surroundings.room else model.dry
+        if of_sums is not self._tables:
+            self._tables = of_sums
+            self._sums[:] = 0.0
+            self._add_evidence(np.arange(self.filled), self._all)
         tables = model.dry if self.surroundings.dry else model.rooms
         places = self._last(frames)
         valid = self._cues.valid[places]

@@ -30,9 +30,8 @@ SEPARATION = 15.0  # degrees between two candidates, at least
 # which the sound comes without a room, and below which not any more. Talkers without a room have -0.02 to 0.05, those
 # at a direct-to-reverberant ratio of 5 dB at most -0.13, sounds with few pauses there -0.16 to -0.01.
 _DRY, _NOT_DRY = -0.02, -0.03
-_FIRST = (
-    -0.2
-)  # of that ratio: a room is assumed for most of a second, as the first sound of a source is dry in rooms, too
+_ROOM = -0.06  # that ratio, below which sums of evidence have the tables for rooms; noise changes it little
+_FIRST = -0.2  # of that ratio: a room is assumed for most of a second, as the first sound of a source is dry there, too
 _RATE = 0.2  # of the mean ratio, for each update
 _CLEAR = 0.7  # mean logarithmic likelihood of a unit; less is noise, in which the factor would make sources
 DECISION_STEP = 4  # frames, one of which is used for that ratio
@@ -103,12 +102,14 @@ class Surroundings:
 
     Attributes
     ----------
+    room : bool
+        Whether the sound comes from a room; without one, or with little reverberation, it may still be noisy.
     dry : bool
-        Whether the sound comes without a room, or with little reverberation, and its cues are clear.
+        Whether it comes without a room, and its cues are clear.
     """
 
     def __init__(self) -> None:
-        self.dry = False
+        self.room, self.dry = True, False
         self._ratio, self._evidence = _FIRST, 0.0
 
     def update(self, rooms: NDArray[np.float32], dry: NDArray[np.float32]) -> None:
@@ -118,6 +119,7 @@ class Surroundings:
             mean = max(float(np.mean(np.abs(in_room))), _EQUAL)
             self._ratio += _RATE * (float(np.mean(without - in_room)) / mean - self._ratio)
             self._evidence += _RATE * (mean - self._evidence)
+            self.room = self._ratio < _ROOM
             self.dry = self._ratio > (_NOT_DRY if self.dry else _DRY) and self._evidence > _CLEAR
 
 

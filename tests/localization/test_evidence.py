@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rosafe.dsp.kernels import EvidenceTables
 from rosafe.localization import angles
 from rosafe.localization.cues import CLASSES, ILD_BINS, ITD_BINS, LEVEL_CLASSES, Cues, floors
 from rosafe.localization.direction_model import TABLES, DirectionModel, Histograms
@@ -47,9 +48,10 @@ def random_cues() -> Cues:
     return Cues(next(rows), next(rows), level, RANDOM.random((FRAMES, CHANNELS)) < 0.8)
 
 
-def direct_sum(model: DirectionModel, cues: Cues, yaw: np.ndarray) -> np.ndarray:
+def direct_sum(tables: EvidenceTables, model: DirectionModel, cues: Cues, yaw: np.ndarray) -> np.ndarray:
     """Return the sums (C, A) of the frames, each turned alone."""
-    terms = model.terms(*model.rows(cues, floors(cues.level))).astype(np.float64)
+    itd, ild = model.rows(cues, floors(cues.level))
+    terms = (tables.itd[itd] + tables.ild[ild]).astype(np.float64)
     turned = [rotate(frame, np.full(CHANNELS, turn)) for frame, turn in zip(terms, yaw, strict=True)]
     return np.asarray(np.sum(turned, axis=0))
 
@@ -58,12 +60,13 @@ def direct_sum(model: DirectionModel, cues: Cues, yaw: np.ndarray) -> np.ndarray
 @pytest.mark.parametrize("block", [1, 7, 30, 100])
 def test_sums_are_those_of_the_frames_in_the_window(model: DirectionModel, block: int, yaw: np.ndarray) -> None:
     cues, window = random_cues(), EvidenceWindow(model, LENGTH)
+    tables = window._tables = model.dry if block == 30 else model.rooms
     for begin in range(0, FRAMES, block):
         part = slice(begin, begin + block)
         window.extend(cues.select(part), np.ones(len(yaw[part])), yaw[part])
         end = min(begin + block, FRAMES)
         kept = slice(max(0, end - LENGTH), end)
-        expected = direct_sum(model, cues.select(kept), yaw[kept])
+        expected = direct_sum(tables, model, cues.select(kept), yaw[kept])
         np.testing.assert_allclose(window.sums(), expected, atol=1e-4)  # single precision is turned
     assert np.abs(expected).max() > 10
 
@@ -75,7 +78,8 @@ def test_units_are_compared_with_reverberation(model: DirectionModel) -> None:
     valid = found.valid[frames]
     itd, ild = (rows[valid] for rows in model.rows(found.select(frames), floor))
     for exponent in (1.0, 0.0):
-        terms = model.terms(itd, ild) if exponent else model.unweighted_terms(itd, ild)
+        weighted = model.rooms.itd[itd] + model.rooms.ild[ild]
+        terms = weighted if exponent else model.unweighted_terms(itd, ild)
         units = model.unit_evidence(model.rooms, found, floor, frames, exponent)
         late = terms - units
         assert np.ptp(late, axis=1).max() < 1e-4 * np.abs(terms).max() and np.abs(late).mean() > 0.1

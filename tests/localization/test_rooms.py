@@ -88,6 +88,25 @@ def test_a_room_is_noticed_and_its_absence(kemar: Head, kemar_model: Path, drr_d
     assert all(first[12:]) and not any(second[12:]) and all(third[22:]), decisions
 
 
+def test_sums_of_noisy_sound_without_a_room_have_its_tables(kemar: Head, kemar_model: Path) -> None:
+    """Those of all frames of the window, also of the frames before it was noticed."""
+    sound = kemar.render(modulated(2.0, 3), RATE, 40.0)
+    sound += np.random.default_rng(4).standard_normal(sound.shape) * np.std(sound)
+    localizer = Localizer(RATE, kemar_model, 1.0)
+    counts = set()
+    for number, begin in enumerate(range(0, sound.shape[1], RATE // 10)):
+        localizer.process(sound[:, begin : begin + RATE // 10])
+        window, model = localizer._evidence, localizer.model
+        rows = model.rows(window._cues.select(slice(window.filled)), window._floor)
+        of_frames = [table[row] for table, row in zip(model.dry[:2], rows, strict=True)]
+        expected = np.sum(of_frames, axis=(0, 1), dtype=np.float64)
+        if not window.surroundings.room:
+            np.testing.assert_allclose(window.sums(), expected, atol=1e-9)
+        counts.add((window.surroundings.room, window.surroundings.dry))
+        assert number < 19 or not window.surroundings.room
+    assert counts == {(True, False), (False, False)}
+
+
 def test_noise_has_the_tables_of_rooms(kemar: Head, kemar_model: Path) -> None:
     """The factor of the evidence without a room would make sources of noise that is as loud as the source."""
     direct = kemar.render(modulated(4.0, 3), RATE, 40.0)
