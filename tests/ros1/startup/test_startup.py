@@ -417,6 +417,7 @@ def test_instance(graph: Graph, arguments: list[str], name: str) -> None:
         assert node.stop() == 0
 
 
+@FORKS
 def test_master_and_address_by_remapping(graph: Graph) -> None:
     command = ["bass-ros", "-i", "mapped", f"__master:={graph.uri}", "__ip:=127.0.0.2"]
     with graph.start(*command, ROS_MASTER_URI="http://127.0.0.1:1", ROS_IP="") as node:

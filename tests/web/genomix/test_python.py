@@ -338,6 +338,6 @@ def test_a_damaged_answer() -> None:
 
 
 def test_a_server_that_is_no_genomixd() -> None:
-    with stranger(b"HTTP/1.0 404 Not Found\r\n\r\n<html>") as server:
-        with error("::genom::mwerr", "expected an answer of genomixd"):
-            genomix.connect(f"127.0.0.1:{server.port}")
+    expected = error("::genom::mwerr", "expected an answer of genomixd")
+    with stranger(b"HTTP/1.0 404 Not Found\r\n\r\n<html>") as server, expected:
+        genomix.connect(f"127.0.0.1:{server.port}")
