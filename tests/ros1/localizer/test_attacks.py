@@ -20,6 +20,7 @@ from rosafe.ros1.localizer.settings import read_settings
 from tests.harness import PATIENCE, Graph, Process, freeze, wait_for
 from tests.ros1.localizer.session import Localizer, acquire, names_of, running_localizer
 
+
 @pytest.fixture
 def talking(graph: Graph, localizer: Localizer, device: str) -> Iterator[Localizer]:
     """Provide a localizer that has found a talker, and check that it finds it again after the attack."""

@@ -21,6 +21,8 @@ from tests.harness import Graph, private_graph, wait_for
 from tests.ros1.localizer.session import running_localizer, watched, watcher
 
 HOP, CHANNELS = 100, 3
+
+
 def test_repeated_messages_have_no_new_frames(graph: Graph) -> None:
     message_class = array_msg(importlib.import_module("rosAFE.msg").rosAFE_TimeFrequencySignalPortStruct)
     topics = {kind: f"/repeated/{kind}" for kind in cues.KINDS}

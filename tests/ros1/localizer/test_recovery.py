@@ -30,6 +30,7 @@ from tests.ros1.localizer.session import (
     watcher,
 )
 
+
 @pytest.fixture
 def empty(graph: Graph, afe: Process) -> Iterator[None]:
     """Leave rosAFE without processors."""
