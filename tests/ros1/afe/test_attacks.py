@@ -33,9 +33,6 @@ def node(graph: Graph, component: str, name: str) -> Iterator[Target]:
         yield Target(graph, process, name)
 
 
-BOTH = pytest.mark.parametrize("target", ["rosAFE", "bass"], indirect=True)
-
-
 @pytest.fixture(scope="module", params=["rosAFE", pytest.param("bass", marks=pytest.mark.exploration)])
 def target(graph: Graph, request: pytest.FixtureRequest) -> Iterator[Target]:
     """Provide a node, which must be healthy after the test; both have the same servers."""
@@ -118,7 +115,6 @@ def misbehaviours(name: str) -> Iterator[Misbehaviour]:
     yield Misbehaviour("XML-RPC", b"", flood=post(body).replace(b"Connection: close\r\n", b"") * 1000)
 
 
-@BOTH
 def test_no_client_affects_the_others(target: Target) -> None:
     """Each is closed within seconds, also all of them at once, and repetitions of a kind are one line in the log."""
     table = list(misbehaviours(target.name))
@@ -145,7 +141,6 @@ def test_the_soft_limit_is_raised(target: Target) -> None:
     assert int(soft) == min(handshake_server.DESCRIPTORS, int(hard)) or int(soft) > handshake_server.DESCRIPTORS
 
 
-@BOTH
 def test_without_descriptors_the_node_waits_and_continues(target: Target) -> None:
     """Subscribers that never read use all descriptors; after their end all waiting clients are served."""
     pid = target.process.pid
