@@ -27,9 +27,9 @@ STAGES = {
 }
 
 
-def wav(path: Path, sample_rate: int = 16000, seconds: float = 3.0, channels: int = 2) -> Path:
+def wav(path: Path, sample_rate: int = 16000, seconds: float = 3.0) -> Path:
     """Write a file of noise."""
-    samples = np.random.default_rng(0).normal(0, 0.1, (round(seconds * sample_rate), channels))
+    samples = np.random.default_rng(0).normal(0, 0.1, (round(seconds * sample_rate), 2))
     soundfile.write(path, samples, sample_rate, subtype="PCM_16")
     return path
 
@@ -118,17 +118,14 @@ def test_an_unplugged_device(pulse: PulseServer, tmp_path: Path, learn: Learn) -
         (["missing.wav"], "missing.wav: No such file", 1),
         (["no/such/x"], "No such file", 1),
         (["short.wav"], "short.wav: expected at least 1 s of sound, got 0.1 s", 1),
-        (["mono.wav"], "2 channels, got 1", 1),
         (["scene:?speed=3"], "unknown option 'speed'", 1),
         (["--out", "short.wav"], "cannot write to short.wav", 1),
         (["hw:77,7"], "::bass::e_device: hw:77,7", 1),
         (["--seconds", "nan"], "expected a number of seconds from 2 to 600, got 'nan'", 2),
-        (["--sceonds", "3"], "unrecognized arguments", 2),
     ],
 )
 def test_errors_are_one_line(arguments: list[str], reason: str, code: int, tmp_path: Path) -> None:
     wav(tmp_path / "short.wav", seconds=0.1)
-    wav(tmp_path / "mono.wav", channels=1)
     before = sorted(tmp_path.rglob("*"))
     with RunningDemo(*arguments, cwd=tmp_path) as demo:
         demo.assert_ends(code, "rosafe demo: ")

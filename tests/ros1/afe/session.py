@@ -82,14 +82,6 @@ class Microphone:
         self.window = joined[:, -self.window.shape[1] :]
         self.index += signal.shape[1]
 
-    def resize(self, chunks: int) -> None:
-        """Set the length of the window to `chunks`; frames before the current window are zeros."""
-        self.chunks = chunks
-        longer = np.zeros((2, chunks * self.chunk), np.int32)
-        kept = self.window[:, -longer.shape[1] :]
-        longer[:, longer.shape[1] - kept.shape[1] :] = kept
-        self.window = longer
-
     @property
     def subscribed(self) -> bool:
         """Return whether there is a subscriber."""
@@ -207,22 +199,7 @@ class Session:
 
     def health(self, accept: Callable[[dict[str, str]], bool], part: str = "audio") -> dict[str, str]:
         """Return the entries of /diagnostics, with level and message, as soon as `accept` is true for them."""
-        from diagnostic_msgs.msg import DiagnosticArray
-
-        with self.graph.collect("/diagnostics", DiagnosticArray) as messages:
-            seen: list[dict[str, str]] = []
-
-            def accepted() -> dict[str, str] | None:
-                statuses = [s for m in list(messages) for s in m.status if s.name == f"{self.name}: {part}"]
-                seen[:] = [
-                    {**{v.key: v.value for v in s.values}, "level": str(s.level), "message": s.message}
-                    for s in statuses
-                ]
-                return next((entries for entries in seen if accept(entries)), None)
-
-            result = wait_for(accepted, what=lambda: f"a state of health, last: {seen[-1:]}")
-        assert result is not None
-        return result
+        return diagnosed(self.graph, f"{self.name}: {part}", accept)
 
     # --- goals ---
 
@@ -285,6 +262,25 @@ class Goal:
     def status(self) -> int:
         """Return the terminal state (actionlib_msgs/GoalStatus)."""
         return int(self.handle.get_goal_status())
+
+
+def diagnosed(graph: Graph, name: str, accept: Callable[[dict[str, str]], bool]) -> dict[str, str]:
+    """Return the entries of a part in /diagnostics, with level and message, as soon as `accept` is true for them."""
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    with graph.collect("/diagnostics", DiagnosticArray) as messages:
+        seen: list[dict[str, str]] = []
+
+        def accepted() -> dict[str, str] | None:
+            statuses = [s for m in list(messages) for s in m.status if s.name == name]
+            seen[:] = [
+                {**{v.key: v.value for v in s.values}, "level": str(s.level), "message": s.message} for s in statuses
+            ]
+            return next((entries for entries in seen if accept(entries)), None)
+
+        result = wait_for(accepted, what=lambda: f"a state of {name}, last: {seen[-1:]}")
+    assert result is not None
+    return result
 
 
 def error_of(response: Any) -> tuple[str, Mapping[str, Any]]:

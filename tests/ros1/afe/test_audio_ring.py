@@ -255,6 +255,10 @@ def test_events_are_reported_as_text() -> None:
     feed(source.message())
     opened(ring, 4)
     assert lines == []
+    source.window = 30
+    feed(source.message())
+    assert lines == ["Audio: the window changed from 12 to 30 frames"]
+    lines.clear()
     source.index += 3
     feed(source.message())
     feed(Source(index=2, number=2).message())

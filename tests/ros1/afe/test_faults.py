@@ -14,8 +14,9 @@ import rosservice
 from actionlib_msgs.msg import GoalStatus
 
 from rosafe.interface import CORE_REPRESENTATIONS, MAX_ACTIVITIES
-from tests.harness import Graph, freeze, proc, run_together, wait_for
+from tests.harness import Graph, freeze, run_together, wait_for
 from tests.ros1.afe.session import Session, error_of, noise, own_node
+from tests.soak.world import ResourceUse
 
 BLOCK = 2000
 
@@ -41,17 +42,6 @@ def test_bass_is_killed_and_restarted(graph: Graph) -> None:
             health = afe.health(lambda entries: int(entries["streams"]) > 1)
             assert health["lost"] == "0"
         assert "Traceback" not in afe.process.err
-
-
-def threads_and_memory(pid: int) -> tuple[int, int]:
-    """Return the number of threads and resident bytes of a process."""
-    status = dict(line.split(":", 1) for line in proc(pid, "status").read_text().splitlines())
-    return int(status["Threads"]), int(status["VmRSS"].split()[0]) * 1024
-
-
-def open_files(pid: int) -> int:
-    """Return the number of open files and sockets of a process."""
-    return len(list(proc(pid, "fd").iterdir()))
 
 
 def test_random_requests_of_eight_clients(afe: Session) -> None:
@@ -111,8 +101,7 @@ def test_all_slots_of_a_task_are_used_and_freed(afe: Session) -> None:
     """With the maximum number of processors of one kind all work, one more is rejected, and none stays."""
     microphone = afe.build("PreProc", "GammatoneProc", "IhcProc", block=BLOCK, fb_nChannels=2)
     afe.wait_activities(["InputProc", "PreProc", "GammatoneProc", "IhcProc"])
-    threads, memory = threads_and_memory(afe.process.pid)
-    files = open_files(afe.process.pid)
+    before = ResourceUse.of(afe.process.pid)
     limit = MAX_ACTIVITIES - 1
     share = (limit + 7) // 8
 
@@ -131,13 +120,13 @@ def test_all_slots_of_a_task_are_used_and_freed(afe: Session) -> None:
     for name in ("ild0", f"ild{limit - 1}"):
         assert afe.read("ild", BLOCK + 1, name=name).framesOnPort == 100
     wait_for(lambda: {len(s.left.dataN) for s in afe.ok("getSignals").signals.ild} == {2})
-    assert threads_and_memory(afe.process.pid)[0] <= threads + 2 * (limit + 1) + 16, "two for each processor"
+    assert ResourceUse.of(afe.process.pid).threads <= before.threads + 2 * (limit + 1) + 16, "two for each processor"
     afe.ok("removeProcessor", name="ild7")
     afe.ok("IldProc", name="more")
     afe.ok("Stop")
     assert afe.processors() == {}
     # on a busy machine, the master needs more than the second for which a request waits to remove hundreds of topics
     wait_for(lambda: not [t for t in afe.graph.topics() if t.startswith("/rosAFE/ildPort/")])
-    wait_for(lambda: threads_and_memory(afe.process.pid)[0] <= threads, what="threads end")
-    assert threads_and_memory(afe.process.pid)[1] < memory + 2**26
-    wait_for(lambda: open_files(afe.process.pid) < files + 50, what="files are closed with their topics")
+    wait_for(lambda: ResourceUse.of(afe.process.pid).threads <= before.threads, what="threads end")
+    assert ResourceUse.of(afe.process.pid).memory < before.memory + 2**26
+    wait_for(lambda: ResourceUse.of(afe.process.pid).files < before.files + 50, what="the end of files of topics")

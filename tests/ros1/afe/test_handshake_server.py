@@ -102,6 +102,7 @@ def test_with_too_many_connections_the_oldest_is_closed(monkeypatch: pytest.Monk
         connections = [it.connect() for _ in range(15)]
         for sock in connections[:5]:
             assert sock.recv(100) == b""
+        assert it.reports[0] == ("", "too many silent connections: the oldest ones are disconnected")
         for sock in connections[5:]:
             sock.sendall(b"still here\n")
             assert sock.recv(100) == b"still here\n"

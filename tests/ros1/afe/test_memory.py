@@ -7,7 +7,7 @@ from pathlib import Path
 from tests.harness import PYTHON, ROOT, Graph, proc
 from tests.plugins.stages import PLAIN, Fault, text_of
 from tests.ros1.afe.session import Session, noise
-from tests.ros1.afe.test_faults import threads_and_memory
+from tests.soak.world import ResourceUse
 
 # Allocates memory of all sizes in many threads, frees almost all, and prints the resident MiB.
 SPREAD = """
@@ -51,9 +51,9 @@ def test_removed_processors_are_freed_without_garbage_collection(graph: Graph, t
             session.ok("removeProcessor", name="gammatone")
 
         cycle()
-        _, before = threads_and_memory(process.pid)
+        before = ResourceUse.of(process.pid).memory
         for _ in range(10):
             cycle()
-        _, after = threads_and_memory(process.pid)
+        after = ResourceUse.of(process.pid).memory
         session.close()
         assert (after - before) / 2**20 < 150, "of some 400 MiB"

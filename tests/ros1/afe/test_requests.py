@@ -17,7 +17,6 @@ from tests.harness import wait_for
 from tests.ros1.afe.session import RATE, Session, noise, own_node
 
 CHAIN = ("PreProc", "GammatoneProc", "IhcProc", "IldProc", "RatemapProc", "CrossCorrelationProc")
-NAMES = {kind: [ROSAFE.service(k.request).parameter("name").default] for kind, k in CORE_REPRESENTATIONS.items()}
 
 
 def snapshot(afe: Session) -> tuple[Any, set[str]]:
@@ -109,50 +108,7 @@ def test_the_order_of_checks(afe: Session) -> None:
     assert snapshot(afe) == before
 
 
-OUT_OF_RANGE: tuple[tuple[str, dict[str, Any], str], ...] = (
-    ("PreProc", {"name": "white space"}, "name"),
-    ("PreProc", {"name": "a//b"}, "name"),
-    ("PreProc", {"name": "x" * 5000}, "name"),
-    ("GammatoneProc", {"fb_highFreqHz": float(RATE)}, "fb_highFreqHz"),
-    ("GammatoneProc", {"fb_cfHz": [100.0] * 5000}, "fb_cfHz"),
-    ("CrossCorrelationProc", {"cc_maxDelaySec": 9.9, "cc_hSizeSec": 0.0001}, "port or history"),
-    ("InputProc", {"nFramesPerBlock": 2**32 - 1}, "nFramesPerBlock"),
-)
-
-
-def test_values_out_of_range_are_rejected_with_the_reason(afe: Session) -> None:
-    """tests/interface and tests/tree have the rules."""
-    afe.build("PreProc", "GammatoneProc", "IhcProc", fb_nChannels=2)
-    before = snapshot(afe)
-    for request_name, values, named in OUT_OF_RANGE:
-        ex, detail = afe.refused(request_name, **{"name": "fresh", **values})
-        assert ex == "::rosAFE::e_badNewValue", (request_name, values)
-        assert list(detail) == ["what"] and named in detail["what"] and "\n" not in detail["what"], (detail, values)
-        assert snapshot(afe) == before, (request_name, values)
-
-
 # --- defaults ---------------------------------------------------------------------------------------------------
-
-
-def test_zeros_are_defaults(afe: Session) -> None:
-    """ROS requests have no defaults: zeros stand for the defaults."""
-    afe.listen()
-    for request in ("InputProc", *CHAIN):
-        afe.ok(request)
-    assert afe.processors() == NAMES
-    parameters = afe.ok("getParameters").parameters
-    for kind, table in CORE_REPRESENTATIONS.items():
-        (struct,) = getattr(parameters, kind)
-        for parameter in table.parameters:
-            if parameter.name not in ("fb_cfHz", "fb_nChannels"):
-                assert getattr(struct, parameter.name) == parameter.default, parameter.name
-    assert parameters.gammatone[0].fb_nChannels == 31
-
-
-def test_unknown_choices_are_replaced(afe: Session) -> None:
-    afe.build("PreProc", "GammatoneProc", "IhcProc", fb_nChannels=2, pp_middleEarModel="jespen", ihc_method="whatever")
-    parameters = afe.ok("getParameters").parameters
-    assert (parameters.preProc[0].pp_middleEarModel, parameters.ihc[0].ihc_method) == ("jepsen", "dau")
 
 
 def test_a_window_too_short_for_the_pitch_range_is_logged_once(afe: Session) -> None:
@@ -164,12 +120,6 @@ def test_a_window_too_short_for_the_pitch_range_is_logged_once(afe: Session) -> 
     afe.ok("AutocorrelationProc", name="long", upperDepName="ihc", ac_wSizeSec=0.04)
     afe.ok("PitchProc", name="voices", upperDepName="long")
     assert afe.process.err.count("pi_rangeHz, ac_wSizeSec") == before + 1
-
-
-def test_a_list_of_one_zero_is_the_default(afe: Session) -> None:
-    afe.build("PreProc")
-    afe.ok("GammatoneProc", fb_cfHz=[0.0], fb_nChannels=3)
-    assert afe.ok("getParameters").parameters.gammatone[0].fb_nChannels == 3
 
 
 def test_parameters_are_returned_exactly(afe: Session) -> None:
@@ -213,73 +163,16 @@ def test_parameters_are_returned_exactly(afe: Session) -> None:
     assert list(parameters.gammatone[0].fb_cfHz) == list(truth["fb_cfHz"])
     assert parameters.gammatone[0].fb_nChannels == 3
     assert list(parameters.crossCorrelation[0].cc_lags) == list(truth["cc_lags"])
-    (reported_input,) = parameters.input
+    afe.ok("modifyParameter", nameProc="input", nameParam="in_normalizeValue", newValue=str(2**64 - 1))
+    (reported_input,) = afe.ok("getParameters").parameters.input
     assert (reported_input.name, reported_input.in_doNormalize, reported_input.in_normalizeValue) == (
         "input",
         True,
-        2**31 - 1,
+        2**64 - 1,
     )
 
 
 # --- dependencies, modification, removal ------------------------------------------------------------------------
-
-
-def test_dependencies_start_at_the_root(afe: Session) -> None:
-    afe.build(*CHAIN, fb_nChannels=2)
-    for name, expected in (
-        ("input", ["input"]),
-        ("ihc", ["input", "preProc", "gammatone", "ihc"]),
-        ("ratemap", ["input", "preProc", "gammatone", "ihc", "ratemap"]),
-        ("crosscorrelation", ["input", "preProc", "gammatone", "ihc", "crosscorrelation"]),
-    ):
-        assert afe.ok("getDependencies", nameProc=name).dependencies == expected
-    for name in ("nobody", "", "IHC", "nameProc", "ï" * 300):
-        assert afe.refused("getDependencies", nameProc=name) == ("::rosAFE::e_noSuchProcessor", {})
-
-
-MODIFICATIONS: tuple[tuple[str, str, str, Any], ...] = (
-    ("input", "in_normalizeValue", "18446744073709551615", 2**64 - 1),
-    ("preProc", "pp_refSPLdBS", "-3.5e1", -35.0),
-    ("ihc", "ihc_method", "unheard of", "dau"),
-    ("ratemap", "set_rm_scailing", "_magnitude", "magnitude"),
-    ("crosscorrelation", "cc_maxDelaySec", "0.0005", 0.0005),
-)
-
-
-def test_modify_parameter(afe: Session) -> None:
-    afe.build(*CHAIN, fb_nChannels=2)
-    for name, parameter, text, value in MODIFICATIONS:
-        afe.ok("modifyParameter", nameProc=name, nameParam=parameter, newValue=text)
-        parameters = afe.ok("getParameters").parameters
-        struct = {p.name: p for kind in CORE_REPRESENTATIONS for p in getattr(parameters, kind)}[name]
-        real = {"pp_refSPLdBS": "pp_refSPLdB", "set_rm_scailing": "rm_scaling"}.get(parameter, parameter)
-        assert getattr(struct, real) == value, (parameter, text)
-        if parameter == "cc_maxDelaySec":
-            assert len(struct.cc_lags) == 2 * math.ceil(0.0005 * RATE) + 1
-
-
-REJECTED = (
-    ("nobody", "nothing", "none", "e_noSuchProcessor"),
-    ("", "", "", "e_noSuchProcessor"),
-    ("input", "pp_bRemoveDC", "1", "e_noSuchParameter"),  # the guide's own example
-    ("preProc", "pp_nothing", "", "e_noSuchParameter"),
-    ("input", "in_normalizeValue", "9" * 4000, "e_badNewValue"),
-    ("preProc", "pp_refSPLdB", "nan", "e_badNewValue"),
-    ("preProc", "pp_cutoffHzDC", "10000", "e_badNewValue"),
-    ("gammatone", "fb_cfHz", "[100, nan]", "e_badNewValue"),
-    ("crosscorrelation", "cc_maxDelaySec", "10.5", "e_badNewValue"),
-)
-
-
-def test_rejected_modifications(afe: Session) -> None:
-    """tests/interface and tests/tree have the rules."""
-    afe.build(*CHAIN, fb_nChannels=2, pp_bRemoveDC=True)
-    before = snapshot(afe)
-    for name, parameter, text, ex in REJECTED:
-        exception, detail = afe.refused("modifyParameter", nameProc=name, nameParam=parameter, newValue=text)
-        assert exception == f"::rosAFE::{ex}", (name, parameter, text)
-        assert (parameter in detail["what"]) if ex == "e_badNewValue" else detail == {}, (name, parameter, text)
-        assert snapshot(afe) == before, (name, parameter, text)
 
 
 def test_removal_includes_descendants_and_frees_the_names(afe: Session) -> None:
@@ -294,14 +187,6 @@ def test_removal_includes_descendants_and_frees_the_names(afe: Session) -> None:
     for request in CHAIN[1:]:
         afe.ok(request)
     assert set(gone) <= afe.graph.topics()
-
-
-def test_rejected_removals(afe: Session) -> None:
-    afe.build("PreProc", "GammatoneProc", fb_nChannels=2)
-    before = snapshot(afe)
-    for name in ("input", "nobody", "", "name", "Preproc"):
-        assert afe.refused("removeProcessor", name=name) == ("::rosAFE::e_noSuchProcessor", {}), name
-    assert snapshot(afe) == before
 
 
 def test_stop_and_start_again(afe: Session) -> None:
@@ -343,6 +228,20 @@ def test_rejected_connections(afe: Session) -> None:
     assert afe.read("input", 401).left[-1] == signal[0, -1] / (2**31 - 1), "the old connection is kept"
 
 
+def test_remapped_topics(graph: harness.Graph) -> None:
+    with own_node(
+        graph, "bass/Audio:=/elsewhere/Audio", "/mapped/preProcPort/preProc:=/shown/here", name="mapped"
+    ) as afe:
+        microphone = afe.listen(topic="/elsewhere/Audio")
+        afe.ok("connect_port", local="Audio", remote="bass/Audio")
+        afe.build("PreProc", block=2000)
+        wait_for(lambda: microphone.subscribed)
+        microphone.play(noise(2000))
+        message = graph.message("/shown/here", accept=lambda m: m.lastFrameIndex == 2001)
+        assert message.framesOnPort == 20000
+        assert afe.topic("preProc") not in graph.topics()
+
+
 def test_names_are_resolved_as_in_ros(afe: Session) -> None:
     microphone = afe.listen()
     relative = microphone.topic[1:]
@@ -354,16 +253,9 @@ def test_names_are_resolved_as_in_ros(afe: Session) -> None:
 def test_errors_are_valid_json_for_any_name(afe: Session) -> None:
     """Quotes, backslashes, line ends and other alphabets of the request are part of the reason."""
     afe.build("PreProc")
-    for name in ('say "hi"', "back\\slash", "two\nlines", "日本語", "tab\t"):
+    before = snapshot(afe)
+    for name in ('say "hi"', "back\\slash", "two\nlines", "日本語", "tab\t", "a//b", "x" * 5000):
         response = afe.call("GammatoneProc", name=name)
         body = json.loads(response.genom_exdetail)
-        assert body["ex"] == "::rosAFE::e_badNewValue" and repr(name) in body["detail"]["what"]
-
-
-def test_simultaneous_requests_for_one_name_create_one_processor(afe: Session) -> None:
-    afe.build("PreProc")
-    responses = harness.run_together(8, lambda _: afe.call("GammatoneProc", fb_nChannels=2))
-    failed = [json.loads(r.genom_exdetail) for r in responses if not r.genom_success]
-    why = "'gammatone' exists already, of kind gammatone"
-    assert failed == [{"ex": "::rosAFE::e_existsAlready", "what": why}] * 7
-    assert afe.processors()["gammatone"] == ["gammatone"]
+        assert body["ex"] == "::rosAFE::e_badNewValue" and (len(name) > 100 or repr(name) in body["detail"]["what"])
+    assert snapshot(afe) == before

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 
 import bass.msg
 from rosafe import interface
-from rosafe.interface import ROSAFE
 from rosafe.ros import array_msg
 from rosafe.ros1.component import serialization
 from rosafe.ros1.transport.publisher import BufferList
@@ -183,18 +182,6 @@ def test_bags_can_store_such_messages(tmp_path: Path) -> None:
         assert [m.left.dataN[2].data[3] for _, m, _ in bag.read_messages()] == [11.0, 11.0]
 
 
-def test_an_absent_signal_has_no_channels() -> None:
-    message = serialization.message_class("rosAFE", TIME_FREQUENCY)(
-        **HEADS[TIME_FREQUENCY], left=np.ones((3, 2)), right=[]
-    )
-    received = plain_class(TIME_FREQUENCY)().deserialize(serialized(message))
-    assert received.right.dataN == [] and len(received.left.dataN) == 3
-    assert serialization.message_class("rosAFE", TIME_FREQUENCY)().deserialize(serialized(message)).right.shape == (
-        0,
-        0,
-    )
-
-
 def test_ragged_signals_are_lists_of_arrays() -> None:
     plain = plain_class(TIME_FREQUENCY)(
         left=_nested([[1.0, 2.0], [3.0]], 2), right=_nested([[], [1.0]], 2), **HEADS[TIME_FREQUENCY]
@@ -232,23 +219,6 @@ def test_audio_is_int32_and_its_stamp_a_struct() -> None:
     with pytest.raises(AttributeError):
         _ = received.stamp.minutes
     assert serialized(received) == serialized(plain)
-
-
-def test_signals_of_all_processors_in_one_response() -> None:
-    one, many = np.arange(4.0), np.arange(6.0).reshape(2, 3)
-    time_domain, plain_time = ours_and_plain(TIME_DOMAIN, one)
-    frequency, plain_frequency = ours_and_plain(TIME_FREQUENCY, many)
-    arrays: dict[str, list[Any]] = {name: [] for name, _ in ROSAFE.structs["::rosAFE::dataObjSt"]}
-    plain_arrays = {name: list(items) for name, items in arrays.items()}
-    arrays["input"], plain_arrays["input"] = [time_domain], [plain_time]
-    arrays["ihc"], plain_arrays["ihc"] = [frequency, frequency], [plain_frequency, plain_frequency]
-    ours = serialization.response_class("rosAFE", "getSignals")(genom_success=True, genom_exdetail="", signals=arrays)
-    plain = rosAFE.srv.getSignalsResponse(True, "", rosAFE.msg.rosAFE_dataObjSt(**plain_arrays))
-    assert serialized(ours) == serialized(plain)
-    received = serialization.response_class("rosAFE", "getSignals")().deserialize(serialized(plain))
-    assert received.genom_success is True
-    np.testing.assert_array_equal(received.signals.ihc[1].left, many)
-    assert received.signals["input"][0]["lastFrameIndex"] == 2**40
 
 
 # --- unreadable messages ----------------------------------------------------------------------------------------

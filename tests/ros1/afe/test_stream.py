@@ -62,22 +62,6 @@ def test_no_loss_is_reported_without_a_loss(fresh: Session) -> None:
     assert health["topic"] == microphone.topic and health["sample rate (Hz)"] == str(RATE)
 
 
-def test_a_restarted_publisher_is_followed(fresh: Session) -> None:
-    first = fresh.build("PreProc", block=BLOCK)
-    first.play(noise(BLOCK + 700, 1))
-    fresh.read("preProc", BLOCK + 1)
-    first.close()
-    second = fresh.microphone = type(first)(fresh.graph, topic=first.topic)  # starts at 0 again
-    wait_for(lambda: second.subscribed)
-    signal = noise(2 * BLOCK, 2)
-    second.play(signal)
-    message = fresh.read("preProc", 2 * BLOCK + 1)
-    np.testing.assert_array_equal(message.left[-2 * BLOCK :], normal(signal)[0])
-    health = fresh.health(lambda entries: entries["streams"] == "2")
-    assert (health["dropped"], health["lost"]) == ("700", "0")
-    assert "a new stream" in fresh.process.err and "700 unread frames" in fresh.process.err
-
-
 def test_garbage_is_ignored_and_the_connection_is_kept(fresh: Session) -> None:
     microphone = fresh.build("PreProc", block=BLOCK)
     signal = noise(2 * BLOCK)
@@ -119,19 +103,6 @@ def test_audio_of_another_rate_is_not_passed_to_the_tree(fresh: Session) -> None
     wait_for(lambda: fresh.health(lambda entries: entries["sample rate (Hz)"] == str(2 * RATE)))
     fresh.ok("InputProc", nFramesPerBlock=BLOCK)
     assert fresh.read("input", 0).sampleRate == 2 * RATE
-
-
-def test_a_window_whose_length_changes(fresh: Session) -> None:
-    microphone = fresh.build("PreProc", block=BLOCK)
-    signal = noise(3 * BLOCK)
-    microphone.play(signal[:, :BLOCK])
-    for chunks, end in ((25, 2 * BLOCK), (2, 3 * BLOCK)):
-        microphone.resize(chunks)
-        microphone.play(signal[:, end - BLOCK : end])
-    assert_holds(fresh.read("preProc", 3 * BLOCK + 1), "preProc", windowed(normal(signal), 1.0, RATE))
-    assert "the window changed from 4000 to 10000 frames" in fresh.process.err
-    health = fresh.health(lambda entries: True)
-    assert (health["lost"], health["streams"], health["breaks"]) == ("0", "1", "0")
 
 
 def test_a_tree_that_is_too_slow_loses_frames_and_reports_it(fresh: Session) -> None:

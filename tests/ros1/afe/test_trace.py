@@ -123,14 +123,6 @@ def test_messages_received_before_an_interrupt_are_part_of_the_trace(monkeypatch
     assert trace._listen("/rosAFE", 100.0) == [0, 1, 2]
 
 
-def test_a_killed_trace_ends_tracing_in_the_node(afe: Session) -> None:
-    afe.build("PreProc")
-    with afe.graph.start(str(SCRIPTS / "rosafe"), "trace") as command:
-        wait_for(lambda: afe.connections("/rosAFE/trace") == 1)
-        command.stop(signal.SIGKILL)
-    wait_for(lambda: afe.connections("/rosAFE/trace") == 0)
-
-
 def test_a_node_without_processors_and_a_missing_node(afe: Session, tmp_path: Path) -> None:
     env: Any = {name: afe.graph.env[name] for name in ("ROS_MASTER_URI", "ROS_IP", "HOME")}
     there = tmp_path / "there.json"

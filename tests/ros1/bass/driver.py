@@ -69,7 +69,7 @@ class Driver:
     ) -> None:
         """Publish samples, int32 (frames, channels), in real time, without the messages with the numbers in `lost`."""
         for number in range(len(samples) // length):
-            if end is not None and end.is_set():
+            if rospy.is_shutdown() or (end is not None and end.is_set()):
                 break
             frame = number * length
             if number not in lost:
@@ -101,7 +101,7 @@ def main() -> None:
     samples = np.load(options.file)
     if options.info:
         driver.describe(samples.shape[1])
-    while not driver.subscribed:
+    while not (driver.subscribed or rospy.is_shutdown()):
         time.sleep(0.01)
     driver.play(samples, options.length, set(options.lost))
     rospy.spin()

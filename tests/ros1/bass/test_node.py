@@ -20,6 +20,7 @@ from rosafe.interface import ComponentError
 from rosafe.ros1.component import serialization
 from tests.audio import bags
 from tests.harness import PATIENCE, Graph, Process, free_port, run_together, wait_for
+from tests.ros1.afe.session import diagnosed
 
 RATE, CHUNK, CHUNKS = 8000, 400, 4
 
@@ -241,13 +242,8 @@ def test_loss_in_the_window_the_log_and_diagnostics(graph: Graph, bass_node: Pro
     shown = np.stack((window.left, window.right))[:, : 3200 + 3200 - window.lastFrameIndex]
     assert np.array_equal(shown, samples[:, 3200 - shown.shape[1] : 3200])
     wait_for(lambda: "lost 1200 frames (0.150 s) after frame 800 (0.10 s)" in bass_node.err)
-
-    def warned(message: Any) -> bool:
-        states = {s.name: (s.level, {pair.key: pair.value for pair in s.values}) for s in message.status}
-        level, values = states.get("bass: capture", (0, {}))
-        return level == 1 and values["device"].startswith("bag:") and "lost 1200 frames" in values["last loss"]
-
-    graph.message("/diagnostics", accept=warned)
+    state = diagnosed(graph, "bass: capture", lambda entries: "lost 1200 frames" in entries["last loss"])
+    assert state["level"] == "1" and state["device"].startswith("bag:")
 
 
 def request(connection: socket.socket, count: int, first: int) -> tuple[int, int, int, np.ndarray]:

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import soundfile
 
-from rosafe.audio.devices.scene import Scene
 from rosafe.ros1.component import serialization
 from tests.audio.test_received import noise
 from tests.commands.command import ROSAFE
 from tests.harness import PYTHON, Graph, Process, python_path, wait_for
+from tests.ros1.afe.session import diagnosed
 from tests.ros1.bass.driver import Driver
 
 RATE, LENGTH, CHUNK = 16000, 160, 400
@@ -100,19 +100,6 @@ def test_a_program_with_lost_messages(graph: Graph, bass: Process, tmp_path: Pat
         assert f"lost {frames} frames ({frames / RATE:.3f} s) after frame " in bass.err
 
 
-def diagnosis(graph: Graph, accept: Any) -> None:
-    """Wait for a state of the capture in /diagnostics, as a level, a summary and values."""
-
-    def found(message: Any) -> bool:
-        return any(
-            accept(status.level, status.message, {pair.key: pair.value for pair in status.values})
-            for status in message.status
-            if status.name == "bass: capture"
-        )
-
-    graph.message("/diagnostics", accept=found)
-
-
 def test_diagnostics_of_losses_and_pauses(graph: Graph, bass: Process, driver: Driver) -> None:
     samples = noise(60 * RATE)
     driver.describe(2)
@@ -120,9 +107,11 @@ def test_diagnostics_of_losses_and_pauses(graph: Graph, bass: Process, driver: D
     with playing(driver, samples, lost=lost):
         assert acquire(graph, f"topic:{driver.topic}").genom_success
         wait_for(lambda: "lost 320 frames" in bass.err)
-        diagnosis(graph, lambda level, text, values: level == 1 and int(values["lost frames"]) % 320 == 0)
+        capture = "bass: capture"
+        diagnosed(graph, capture, lambda found: found["level"] == "1" and int(found["lost frames"]) % 320 == 0)
     wait_for(lambda: f"topic:{driver.topic}: no sound for 1.02 s; waiting for its publisher" in bass.err)
-    diagnosis(graph, lambda level, text, _: level == 1 and text.startswith("capturing, but no sound for "))
+    silent = "capturing, but no sound for "
+    assert diagnosed(graph, capture, lambda found: found["message"].startswith(silent))["level"] == "1"
     settled = driver.newest - 2 * CHUNK / RATE
     before = graph.message("/bass/Audio", audio_class(), lambda m: moment(m) > settled)
     driver.play(samples[: 150 * LENGTH], LENGTH)  # the stamps are those of the beginning: the clock was set
@@ -141,29 +130,6 @@ def playing(driver: Driver, samples: np.ndarray, **options: Any) -> Iterator[thr
     yield thread
     end.set()
     thread.join()
-
-
-def test_a_restarted_driver_continues_with_its_time(graph: Graph, bass: Process, tmp_path: Path) -> None:
-    """The time without a driver counts as lost sound."""
-    samples = noise(20 * RATE)
-    with program(graph, tmp_path / "a.npy", samples, info="/audio_info") as (topic, first):
-        assert acquire(graph, f"topic:{topic}", chunks=4000).genom_success
-        graph.message("/bass/Audio", audio_class(), lambda m: m.lastFrameIndex > RATE)
-        first.close()
-        wait_for(lambda: f"topic:{topic}: no sound for" in bass.err)
-        before = graph.message("/bass/Audio", audio_class())
-        with graph.start(*first.command, PYTHONPATH=python_path(graph)):
-            after = graph.message(
-                "/bass/Audio", audio_class(), lambda m: m.lastFrameIndex > before.lastFrameIndex + RATE
-            )
-    frames = after.lastFrameIndex - before.lastFrameIndex
-    assert abs(moment(after) - moment(before) - frames / RATE) < 0.01
-    sound = window(after)[:, -frames:]
-    begin = int(np.argmax(sound[0] == 0))  # before it, the rest of an incomplete chunk
-    gap = int(np.argmax(sound[0, begin:] != 0))
-    rest = sound[:, begin + gap :]
-    assert begin < CHUNK and gap > RATE and np.array_equal(rest, samples.T[:, : rest.shape[1]])
-    graph.call("/bass/Stop")
 
 
 def test_messages_without_stamps(graph: Graph, bass: Process) -> None:
@@ -195,38 +161,22 @@ def test_a_second_publisher(graph: Graph, bass: Process, driver: Driver, tmp_pat
 
 
 def test_acquire_names_unusable_topics(graph: Graph, bass: Process, driver: Driver) -> None:
-    """The running acquisition continues."""
+    """The running acquisition continues. tests/audio/test_received.py has the rules of formats and descriptions."""
     assert acquire(graph, "scene:").genom_success
-    silent = f"topic:{driver.topic}"
-    format_ = "?format=S16LE&rate=16000&of=2"
     expected = {
         "topic:/nobody": ("e_device", "/nobody: the topic has no publisher; start the driver, or call Acquire of"),
         "topic:a b": ("e_device", "expected the name of a topic, such as /audio"),
         "topic:/bass/Audio": ("e_device", "expected the topic of another node, got the port of this bass"),
         "topic:/rosout": ("e_device", "got type rosgraph_msgs/Log"),
-        silent: ("e_device", "without AudioInfo, add ?format=S16LE&rate=16000&of=2"),
-        silent + format_: ("e_device", "no message has arrived; start the driver"),
     }
     for device, (code, why) in expected.items():
         found = refused(acquire(graph, device))
         assert found[0] == f"::bass::{code}" and why in found[1], (device, found)
-    driver.describe(2, coding="mp3")
-    assert "got 'mp3'; set the driver's format to wave" in refused(acquire(graph, silent))[1]
     driver.describe(4)
-    assert refused(acquire(graph, silent))[0] == "::bass::e_hwparams"
+    assert refused(acquire(graph, f"topic:{driver.topic}"))[0] == "::bass::e_hwparams"
     index = graph.message("/bass/Audio", audio_class()).lastFrameIndex
     graph.message("/bass/Audio", audio_class(), lambda m: m.lastFrameIndex > index)
     wait_for(lambda: not driver.subscribed)
-
-
-def test_the_format_changes(graph: Graph, bass: Process, driver: Driver) -> None:
-    driver.describe(2)
-    with playing(driver, noise(60 * RATE)):
-        assert acquire(graph, f"topic:{driver.topic}").genom_success
-        assert acquire(graph, f"topic:{driver.topic}").genom_success  # a second one, of a latched description
-        driver.describe(2, form="S32LE")
-    why = "the format changes from S16LE at 16000 Hz with 2 channels to S32LE at 16000 Hz with 2 channels; call Acquire"
-    wait_for(lambda: f"topic:{driver.topic}: {why}" in bass.err)
 
 
 def written(data: bytes) -> Any:
@@ -245,21 +195,6 @@ def test_malformed_messages(graph: Graph, bass: Process, driver: Driver) -> None
     place(message, samples.T)
     assert "malformed messages are not used: " in bass.err and "Traceback" not in bass.err
     graph.call("/bass/Stop")
-
-
-def test_another_bass(graph: Graph, bass: Process) -> None:
-    with graph.node("bass-ros", "-i", "remote") as remote:
-        fields = {"device": "scene:", "sampleRate": RATE, "nFramesPerChunk": 320, "nChunksOnPort": 20}
-        assert graph.call("/remote/Acquire", **fields).genom_success
-        assert "expected no options for a port" in refused(acquire(graph, "topic:/remote/Audio?rate=1"))[1]
-        assert "expected 8000 Hz, got 16000 Hz" in refused(acquire(graph, "topic:/remote/Audio", 8000))[1]
-        assert acquire(graph, "topic:/remote/Audio").genom_success
-        message = graph.message("/bass/Audio", audio_class(), lambda m: m.lastFrameIndex > RATE // 2)
-        scene = Scene(RATE).frames(60 * RATE)
-        place(message, scene)
-        assert graph.call("/remote/Acquire", **fields).genom_success
-        wait_for(lambda: "a new stream begins (its index falls from" in bass.err, what=lambda: str(remote))
-        wait_for(lambda: not graph.call("/bass/getAcquisition").running)
 
 
 def test_record_and_replay(graph: Graph, bass: Process, tmp_path: Path) -> None:

@@ -70,6 +70,12 @@ def test_end_and_new_stream(source: TopicSource, microphone: Microphone) -> None
         source.read()
 
 
+def test_options_and_another_rate_are_rejected(microphone: Microphone) -> None:
+    for options, rate, why in (("?rate=1", 0, "expected no options for a port"), ("", 8000, "8000 Hz, got 20000 Hz")):
+        with pytest.raises(ComponentError, match=why):
+            TopicSource(microphone.topic + options, rate, 0, threading.Event())
+
+
 def test_only_old_audio_is_an_error(source: TopicSource, microphone: Microphone) -> None:
     with pytest.raises(ComponentError, match=r"got only old ones.* call Acquire"):
         while source.read() is not None:  # the pause

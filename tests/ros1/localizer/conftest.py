@@ -11,7 +11,7 @@ import soundfile
 
 from tests.harness import Graph, Process
 from tests.localization.conftest import KEMAR, RATE, kemar_model, modulated, sphere_model
-from tests.ros1.localizer.session import Localizer, running_localizer
+from tests.ros1.localizer.session import Localizer, running_localizer, scene_file
 
 __all__ = ["KEMAR", "RATE", "kemar_model", "sphere_model"]
 
@@ -44,6 +44,13 @@ def talker(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("sounds") / "talker.wav"
     soundfile.write(path, modulated(4.0, 3), RATE, subtype="FLOAT")
     return path
+
+
+@pytest.fixture(scope="module")
+def device(talker: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return a scene with a talker at 40 degrees."""
+    text = f"sample_rate: {RATE}\nsources:\n  - {{name: talker, file: {talker}, loop: true, azimuth: 40}}\n"
+    return scene_file(tmp_path_factory.mktemp("scene"), text)
 
 
 @pytest.fixture(scope="module")

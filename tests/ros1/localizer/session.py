@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from tests.harness import PYTHON, SCRIPTS, Graph, Process, wait_for
+from tests.ros1.afe.session import diagnosed
 
 PRESENT = 0.5
 
@@ -64,22 +65,7 @@ class Localizer:
 
     def state(self, accept: Callable[[dict[str, str]], bool]) -> dict[str, str]:
         """Return the entries of /diagnostics, with level and message, as soon as `accept` is true for them."""
-        from diagnostic_msgs.msg import DiagnosticArray
-
-        seen: list[dict[str, str]] = []
-        with self.graph.collect("/diagnostics", DiagnosticArray) as messages:
-
-            def accepted() -> dict[str, str] | None:
-                statuses = [s for m in list(messages) for s in m.status if s.name == f"{self.name}: localization"]
-                seen[:] = [
-                    {**{v.key: v.value for v in s.values}, "level": str(s.level), "message": s.message}
-                    for s in statuses
-                ]
-                return next((entries for entries in seen if accept(entries)), None)
-
-            found = wait_for(accepted, what=lambda: f"a state of the localizer, last: {seen[-1:]}")
-        assert found is not None
-        return found
+        return diagnosed(self.graph, f"{self.name}: localization", accept)
 
 
 # Prints the time and the azimuths in degrees of the present sources of each message.

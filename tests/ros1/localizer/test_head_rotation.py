@@ -84,17 +84,6 @@ def test_audio_delay_corrects_the_sound_card() -> None:
     assert angles.difference(yaw[0], 95.0) == pytest.approx(0, abs=0.01)  # 50 ms at 100 degrees/s are 5 degrees
 
 
-def test_a_chain_of_frames_some_of_them_static() -> None:
-    head = Head()
-    head.tf(transform("map", "world", 0.0, 10.0), transform("torso", "neck", 0.0, 90.0), static=True)
-    for time in (START, START + 1):
-        head.tf(transform("map", "torso", time, 30.0), transform("torso", "arm", time, 70.0))
-        head.tf(transform("neck", "head", time, 20.0 * (time - START)))
-        head.tf(transform("map", "torso", time, 30.0))
-    yaw, known = head.head.lookup(np.array([START + 0.25]))
-    assert known.all() and yaw[0] == pytest.approx(-10 + 30 + 90 + 5, abs=0.01)
-
-
 def test_frames_wait_for_their_transform(clock: list[float]) -> None:
     head = Head()
     head.turn(1.0, 10.0)

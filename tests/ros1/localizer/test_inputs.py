@@ -18,11 +18,9 @@ from rosafe.ros import FrameClock, array_msg
 from rosafe.ros1.localizer import inputs
 from rosafe.ros1.localizer.inputs import PortSource
 from tests.harness import Graph, private_graph, wait_for
-from tests.ros1.localizer.conftest import RATE
-from tests.ros1.localizer.session import running_localizer, scene_file, watched, watcher
+from tests.ros1.localizer.session import running_localizer, watched, watcher
 
 HOP, CHANNELS = 100, 3
-SCENE = "sample_rate: {rate}\nsources:\n  - {{name: talker, file: {file}, loop: true, azimuth: 40}}\n"
 
 
 def test_repeated_messages_have_no_new_frames(graph: Graph) -> None:
@@ -79,8 +77,7 @@ def test_messages_of_an_earlier_stream_are_dropped(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.exploration
-def test_a_clock_that_stands_is_logged_rarely(tmp_path: Path, talker: Path, sphere_model: Path) -> None:
-    device = scene_file(tmp_path, SCENE.format(rate=RATE, file=talker))
+def test_a_clock_that_stands_is_logged_rarely(tmp_path: Path, device: str, sphere_model: Path) -> None:
     with private_graph(tmp_path / "home") as (graph, _):
         graph.run("rosparam", "set", "/use_sim_time", "true")
         with (

@@ -7,15 +7,14 @@ from pathlib import Path
 import pytest
 
 from tests.harness import Graph, Process, wait_for
-from tests.ros1.localizer.session import acquire, names_of, running_localizer, scene_file
+from tests.ros1.localizer.session import acquire, names_of, running_localizer
 
 
 @pytest.mark.parametrize("also_the_localizer", [pytest.param(False, marks=pytest.mark.exploration), True])
 def test_restored_processors_are_removed_at_the_end(
-    graph: Graph, bass: Process, talker: Path, sphere_model: Path, tmp_path: Path, also_the_localizer: bool
+    graph: Graph, bass: Process, device: str, sphere_model: Path, tmp_path: Path, also_the_localizer: bool
 ) -> None:
-    scene = f"sample_rate: 16000\nsources:\n  - {{name: talker, file: {talker}, loop: true, azimuth: 40}}\n"
-    acquire(graph, scene_file(tmp_path, scene))
+    acquire(graph, device)
     name = f"kept_{int(also_the_localizer)}"
     command = ("rosAFE-ros", "-i", name, "--keep", str(tmp_path / "tree.yaml"))
     options = ("--head", str(sphere_model), "--rosafe", name)

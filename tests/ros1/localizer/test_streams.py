@@ -21,7 +21,6 @@ from rosafe.ros1.localizer.publishers import source_markers
 from rosafe.ros1.transport.paths import PYPI_DIR
 from tests.harness import PYTHON, ROOT, Graph, Process, private_graph, wait_for
 from tests.localization.conftest import MUSIC, TALKER, take
-from tests.localization.sounds import assert_crossed, crossing
 from tests.localization.test_enhancement import si_sdr
 from tests.ros1.localizer.conftest import RATE
 from tests.ros1.localizer.session import Localizer, acquire, running_localizer, wait_played
@@ -143,21 +142,6 @@ def test_markers_are_filled_for_sources_that_speak() -> None:
     assert first.action == first.DELETEALL
     assert (filled.type, filled.id) == (filled.SPHERE, 7) and filled.pose.position.y == pytest.approx(1)
     assert (hollow.type, hollow.id) == (hollow.LINE_STRIP, 8) and {round(point.x, 6) for point in hollow.points} == {1}
-
-
-@pytest.mark.exploration
-def test_voices_that_cross_keep_their_ids(
-    graph: Graph, bass: Process, localizer: Localizer, take: Any, tmp_path: Path
-) -> None:
-    """A talker moves past the music, which stays."""
-    path = tmp_path / "cross.wav"
-    truths = crossing(take[1], path)
-    audio_class = importlib.import_module("rosAFE.msg").SourceAudio
-    with graph.collect("/localizer/streams", audio_class) as received, localizer.collect() as sources:
-        acquire(graph, f"file:{path}")
-        wait_played(bass, path, sources)
-        messages = list(received)
-    assert_crossed([(m.id, m.header.stamp.to_sec(), m.first_sample, m.samples) for m in messages], truths)
 
 
 def test_streams_without_the_detector(

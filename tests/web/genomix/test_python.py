@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import copy
-import http.server
 import inspect
 import math
 import multiprocessing
 import pickle
 import re
 import signal
-import threading
 import wave
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +22,7 @@ from rosafe.web.genomix.formats import PACKED
 from tests import harness
 from tests.web.genomix import world as worlds
 from tests.web.genomix.test_server import live_activities
+from tests.web.genomix.test_strangers import stranger
 from tests.web.genomix.world import World
 
 pytestmark = pytest.mark.ros
@@ -339,17 +338,6 @@ def test_a_damaged_answer() -> None:
 
 
 def test_a_server_that_is_no_genomixd() -> None:
-    class Other(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(404)
-            self.end_headers()
-            self.wfile.write(b"<html>")
-
-        def log_message(self, *args: object) -> None:
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Other) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        with error("::genom::mwerr", "expected an answer of genomixd"):
-            genomix.connect(f"127.0.0.1:{server.server_port}")
-        server.shutdown()
+    expected = error("::genom::mwerr", "expected an answer of genomixd")
+    with stranger(b"HTTP/1.0 404 Not Found\r\n\r\n<html>") as server, expected:
+        genomix.connect(f"127.0.0.1:{server.port}")

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import socket
-import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from rosafe.web.genomix import formats
 from rosafe.web.genomix.formats import PACKED
 from tests import harness
 from tests.matlab import octave
@@ -132,12 +130,6 @@ def test_tcl_reports_invalid_answers(body: bytes, reported: str, tmp_path: Path)
 
 STRANGE = {
     "web page": b"<html>hello</html>",
-    "52 bytes": formats.SIGNAL
-    + struct.pack("<I", 3)
-    + b"".join(
-        formats.packed_text(name) + struct.pack("<I", size) for name, size in (("a", 2**32 - 1), ("b", 1), ("c", 0))
-    ),
-    "cut": PACKED.plain({"name": "rosAFE"})[:-3],
     "number": PACKED.plain(7),
     "other structure": PACKED.plain({"a": 1}),
     "no structures": PACKED.plain({"name": "x", "instance": "x", "services": 1, "ports": 2}),

@@ -49,18 +49,6 @@ def test_handles_are_commands_by_their_literal_names(world: World) -> None:
     """) == ["genomix2", "bass|rosAFE", "|::rosAFE::getSignals", "0|1", "0|"]
 
 
-def test_instances_and_aliases(world: World) -> None:
-    with world.graph.node("bass-ros", "-i", "left"):
-        assert world.lines("""
-            set g [genomix::connect $address]
-            show [$g load bass -i left] [$g load bass -i left as ears] [$g load bass as right]
-            left::Acquire {device scene: nFramesPerChunk 700}
-            show [dict get [ears::Audio] Audio nFramesPerChunk] [dict get [left::Audio] Audio nFramesPerChunk]
-            show [dict exists [right::Audio] Audio]
-            left::kill
-        """) == ["left|ears|right", "700|700", "1"]
-
-
 def test_aliases_are_commands(world: World) -> None:
     names = "getSignal Gammatone Ratemap CrossCorrelation kill abort_activity connect_service ratemapProcPort"
     test = "if {[info commands ::rosAFE::$name] eq {}} {error $name}"
@@ -193,23 +181,6 @@ def test_results_are_dicts_with_indexed_sequences(world: World) -> None:
         "signals|input preProc gammatone ihc ild ratemap crossCorrelation",
         "dataObj {input {} preProc {} gammatone {} ihc {} ild {} ratemap {} crossCorrelation {}}",
     ]
-
-
-def test_numbers_are_those_of_the_node(world: World) -> None:
-    """A port has the same numbers in Tcl and in JSON."""
-    head, numbers = world.lines("""
-        start_tree
-        while {[dict get [rosAFE::preProcPort preProc] preProcPort lastFrameIndex] == 0} {after 20}
-        bass::Stop
-        set port [dict get [rosAFE::gammatonePort gammatone] gammatonePort]
-        show [dict get $port numberOfChannels] [dict size [dict get $port left dataN 0 data]]
-        show {*}[lrange [dict values [dict get $port right dataN 3 data]] end-99 end]
-    """)
-    assert head == "4|44100"
-    port = world.http.call("rosAFE/gammatonePort/gammatone")["gammatonePort"]
-    expected = port["right"]["dataN"][3]["data"][-100:]
-    assert [float(number) for number in numbers.split("|")] == expected
-    assert any(expected)
 
 
 def test_one_representation_is_smaller_than_all_of_them(world: World) -> None:

@@ -43,6 +43,9 @@ def test_a_component_that_starts_ends_and_restarts(empty_world: World) -> None:
         bass.stop(signal.SIGKILL)
         assert "bass ended before its activity did" in world.http.wait(number, "error")["exception"]["detail"]["what"]
         assert world.http.status(waiting, s="u")["status"] in ("error", "sent")
+        assert "/bass/Stop" in world.graph.services()
+        reported = problem(world, "bass/Stop")
+        assert "bass is not running any more, though it is still registered at the master" in reported
     assert "bass is not running" in problem(world, "bass/Stop")
     assert "bass is not running" in problem(world, "bass/Audio")
     failed = world.http.send("bass/Acquire", {"device": "scene:"})
@@ -54,17 +57,6 @@ def test_a_component_that_starts_ends_and_restarts(empty_world: World) -> None:
         harness.wait_for(lambda: world.http.call("bass/Audio")["Audio"]["lastFrameIndex"] > 0)
         world.http.call("bass/kill")
         assert world.http.wait(number, "done")["output"] == {}
-
-
-def test_a_registration_that_a_killed_node_left(empty_world: World) -> None:
-    world = empty_world
-    with world.graph.node("bass-ros") as bass:
-        world.http.call("bass/Stop")
-        bass.stop(signal.SIGKILL)
-        assert "/bass/Stop" in world.graph.services()
-        assert "bass is not running any more, though it is still registered at the master" in problem(
-            world, "bass/Stop"
-        )
 
 
 def test_a_component_that_hangs_does_not_delay_others(empty_world: World) -> None:
@@ -177,19 +169,6 @@ def await_clients(world: World) -> None:
             return parts <= {connection[4] for connection in node.getBusInfo("/test")[2]}
 
         harness.wait_for(connected, what=f"all connections to {component.name}")
-
-
-def test_a_component_that_moves_is_found_again(empty_world: World) -> None:
-    """The last known address is used first; another component there is recognised."""
-    world = empty_world
-    with world.graph.node("bass-ros") as bass:
-        world.http.call("bass/Stop")
-        world.http.call("bass/Audio")
-        bass.stop(signal.SIGKILL)
-    for _ in range(2):
-        with world.graph.node("bass-ros"):
-            assert world.http.call("bass/Stop") == {}
-            assert world.http.call("bass/Audio")["Audio"]["left"] == []
 
 
 # bass-ros that opens a source only when the file argv[1] exists, unless it is stopped before.
