@@ -23,6 +23,7 @@ from rosafe.representations.ratemap import Ratemap
 from .bare import FloatArray, cut, run
 from .stages import noise
 
+
 def impulse(samples: int) -> FloatArray:
     block = np.zeros((2, samples))
     block[0, 0], block[1, 0] = 1.0, -0.5
