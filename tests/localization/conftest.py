@@ -1,8 +1,7 @@
-"""A small direction model of the sphere at 16 kHz, and a cache of models of its own."""
+"""Direction models at 16 kHz of the sphere, of the MIT KEMAR head and of two microphones."""
 
 from __future__ import annotations
 
-import fcntl
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +9,9 @@ import pytest
 import scipy.signal
 import soundfile
 
-from rosafe.localization import training
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.head import Head
-from tests import harness, models
+from tests import models
 
 from .sounds import RATE, RECORDINGS, music
 
@@ -49,27 +47,27 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
 
 
 @pytest.fixture(scope="session")
-def kemar_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the file of a model of the MIT KEMAR head.
-
-    The first process of a run of the tests that needs it learns it.
-    """
-    if not KEMAR.exists():
-        pytest.skip("Debian's libmysofa1 is not installed")
-    path = harness.folder_of_run(tmp_path_factory) / "kemar.head"
-    with open(path.with_suffix(".lock"), "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not path.exists():
-            training.learn_head(Head.from_sofa(KEMAR), RATE).save(path)
-    return path
-
-
-@pytest.fixture(scope="session")
 def kemar() -> Head:
     """Return the MIT KEMAR head."""
     if not KEMAR.exists():
         pytest.skip("Debian's libmysofa1 is not installed")
     return Head.from_sofa(KEMAR)
+
+
+@pytest.fixture(scope="session")
+def kemar_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the file of a model of the MIT KEMAR head, which is also that of tests/validation."""
+    if not KEMAR.exists():
+        pytest.skip("Debian's libmysofa1 is not installed")
+    path = tmp_path_factory.mktemp("model") / "kemar.head"
+    models.learn(tmp_path_factory, RATE, head=Head.from_sofa(KEMAR)).save(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def pair_model(tmp_path_factory: pytest.TempPathFactory) -> DirectionModel:
+    """Return the model of microphones with a distance of 58 mm, learned from less sound than usual."""
+    return models.learn(tmp_path_factory, RATE, head=Head.pair(0.058))
 
 
 def modulated(seconds: float, seed: int, rate: int = RATE) -> np.ndarray:
