@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,10 @@ import pytest
 import scipy.signal
 import soundfile
 
+from rosafe.localization import training
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.head import Head
-from tests import models
+from tests import harness, models
 
 from .sounds import RATE, RECORDINGS, music
 
@@ -56,11 +58,17 @@ def kemar() -> Head:
 
 @pytest.fixture(scope="session")
 def kemar_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the file of a model of the MIT KEMAR head, which is also that of tests/validation."""
+    """Return the file of a model of the MIT KEMAR head, learned from as much sound as usual, which rooms need.
+
+    The first process of a run of the tests that needs it learns it.
+    """
     if not KEMAR.exists():
         pytest.skip("Debian's libmysofa1 is not installed")
-    path = tmp_path_factory.mktemp("model") / "kemar.head"
-    models.learn(tmp_path_factory, RATE, head=Head.from_sofa(KEMAR)).save(path)
+    path = harness.folder_of_run(tmp_path_factory) / "kemar.head"
+    with open(path.with_suffix(".lock"), "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            training.learn_head(Head.from_sofa(KEMAR), RATE).save(path)
     return path
 
 
