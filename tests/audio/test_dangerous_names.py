@@ -13,25 +13,20 @@ from tests.commands.command import refused, rosafe
 from tests.harness import Graph, Process
 
 pytestmark = pytest.mark.ros
-ATTACKS = (
-    "tee:null,'|touch MARK',raw",
-    "plug:\"file:'|touch MARK',raw\"",
-    "plug:SLAVE='file:FILE=|touch MARK'",
-    "file1:a/b",
-)
+ATTACK = "tee:null,'|touch MARK',raw"
 WHY = "expected the name of a PCM"
 
 
-@pytest.mark.parametrize("name", ATTACKS, ids=range(len(ATTACKS)))
-def test_through_the_command(tmp_path: Path, name: str) -> None:
-    refused(rosafe("record", "--device", name, "--seconds", "1", cwd=tmp_path), WHY)
-    refused(rosafe("record", "a.wav", "--device", name, "--seconds", "1", cwd=tmp_path), WHY)
+def test_through_the_command(tmp_path: Path) -> None:
+    """test_pcmname.py has all names."""
+    refused(rosafe("record", "--device", ATTACK, "--seconds", "1", cwd=tmp_path), WHY)
+    refused(rosafe("record", "a.wav", "--device", ATTACK, "--seconds", "1", cwd=tmp_path), WHY)
     assert os.listdir(tmp_path) == []
 
 
 def test_the_reason_is_returned_and_the_acquisition_continues(graph: Graph, bass_node: Process) -> None:
     assert graph.call("/bass/Acquire", device="scene:", sampleRate=8000, nFramesPerChunk=400).genom_success
-    answer = graph.call("/bass/Acquire", device=ATTACKS[0])
+    answer = graph.call("/bass/Acquire", device=ATTACK)
     error = json.loads(answer.genom_exdetail)
     assert error["ex"] == "::bass::e_device"
     audio = serialization.message_class("bass", "::binaudio::portStruct")

@@ -65,6 +65,7 @@ def test_float_samples_are_scaled_rounded_and_clipped(tmp_path: Path, subtype: s
     read = read_all(f"file:{tmp_path / 'f.wav'}", len(values))
     assert read[0].tolist() == left
     assert np.array_equal(read, to_int32(np.stack((stored, -stored))))
+    assert to_int32(np.array([1e308, -1e308])).tolist() == [full, -(2**31)]
 
 
 def test_last_chunk_is_padded_with_zeros(tmp_path: Path) -> None:
@@ -123,16 +124,10 @@ def test_stop_ends_a_wait(tmp_path: Path) -> None:
 def bad_files(tmp_path: Path) -> Path:
     """Create a folder with files that cannot be played."""
     soundfile.write(tmp_path / "good.wav", noise(1000), RATE, subtype="PCM_16")
-    soundfile.write(tmp_path / "good.flac", noise(20000), RATE, subtype="PCM_16")
-    for name in ("good.wav", "good.flac"):
-        data = (tmp_path / name).read_bytes()
-        (tmp_path / name.replace("good", "cut")).write_bytes(data[: len(data) // 2])
     (tmp_path / "header.wav").write_bytes((tmp_path / "good.wav").read_bytes()[:20])
     (tmp_path / "empty.wav").touch()
     soundfile.write(tmp_path / "nothing.wav", np.zeros((0, 2), np.int16), RATE)
     (tmp_path / "text.wav").write_text("hello, world\n" * 100)
-    (tmp_path / "folder.wav").mkdir()
-    os.mkfifo(tmp_path / "fifo.wav")
     soundfile.write(tmp_path / "mono.wav", noise(10, 1), RATE)
     soundfile.write(tmp_path / "five.wav", noise(10, 5), RATE)
     return tmp_path
@@ -143,14 +138,10 @@ def bad_files(tmp_path: Path) -> Path:
     [
         ("", "e_device", "expected file:PATH, got an empty path"),
         ("missing.wav", "e_device", "No such file"),
-        ("folder.wav", "e_device", "regular file"),
-        ("fifo.wav", "e_device", "regular file"),
         ("empty.wav", "e_device", "expected a sound file, got an empty file"),
         ("nothing.wav", "e_device", "expected samples, got none"),
         ("text.wav", "e_device", "expected a sound file, got another file"),
         ("header.wav", "e_device", "expected a chunk of sound, got none; the file is truncated"),
-        ("cut.wav", "e_device", "truncated"),
-        ("cut.flac", "e_device", "truncated"),
         ("x" * 4000, "e_device", "too long"),
         ("good.wav?speed=2", "e_device", "unknown option 'speed'; expected one of channels, loop, start"),
         ("good.wav?loop=yes", "e_device", "loop: expected a whole number from 0 to 1, got 'yes'"),

@@ -22,6 +22,7 @@ from rosafe.localization.recordings import learn_recordings
 from rosafe.localization.scene_file import SceneError, read_scene
 from rosafe.processing.sounds import read_ears
 from tests.commands.command import environment
+from tests.commands.command import rosafe as command
 from tests.harness import PYTHON, ROOT
 
 RATE = 44100
@@ -359,11 +360,6 @@ def test_a_device_remarks_once(tmp_path: Path) -> None:
         "samples beyond full scale are clipped",
     ]
     source.close()
-
-
-def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    line = [PYTHON, "-m", "rosafe.commands", *map(str, arguments)]
-    return subprocess.run(line, env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
 
 
 def test_commands_print_remarks(tmp_path: Path) -> None:

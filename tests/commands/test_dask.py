@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 from collections.abc import Iterator
@@ -16,12 +17,14 @@ from tests.harness import proc, wait_for
 
 if not Path("/proc/meminfo").exists():
     pytest.skip("Dask needs /proc, which is not mounted here", allow_module_level=True)
-distributed = pytest.importorskip("distributed")
+if importlib.util.find_spec("distributed") is None:  # its import takes seconds, in each process that runs tests
+    pytest.skip("Dask is not installed", allow_module_level=True)
 
 
 @pytest.fixture
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Two worker processes with one thread each."""
+    distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
         n_workers=2,
         threads_per_worker=1,
@@ -39,7 +42,7 @@ def test_a_worker_is_killed_during_the_run(tmp_path: Path, cluster: Any) -> None
     sounds = corpus(tmp_path / "corpus", 40)
     (tmp_path / "corpus" / "bad.wav").write_bytes(b"")
     out = tmp_path / "out"
-    with distributed.Client(cluster) as client:
+    with cluster.get_client() as client:
         workers = list(client.run(os.getpid).values())
     assert len(workers) == 2
     arguments = ("process", "corpus", "-o", "out", *OPTIONS, "--dask", cluster.scheduler_address)

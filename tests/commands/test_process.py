@@ -26,29 +26,6 @@ def assert_equal(path: Path, expected: dict[str, Any]) -> None:
         np.testing.assert_array_equal(loaded[name], value, strict=isinstance(value, np.ndarray), err_msg=name)
 
 
-def test_integer_files(tmp_path: Path) -> None:
-    kinds = {
-        "u8.wav": ("PCM_U8", 8),
-        "16.wav": ("PCM_16", 16),
-        "24.wav": ("PCM_24", 24),
-        "32.wav": ("PCM_32", 32),
-        "flac.flac": ("PCM_16", 16),
-        "aiff.aiff": ("PCM_24", 24),
-    }
-    signals = {}
-    for name, (subtype, bits) in kinds.items():
-        full = 2 ** (bits - 1)
-        signals[name] = np.random.default_rng(bits).integers(-full, full, (2, 5000)) / full  # exact in this format
-        write(tmp_path / name, signals[name], subtype=subtype)
-    done = rosafe("process", *kinds, *SMALL, "--outputs", "input,ild", cwd=tmp_path)
-    assert done.returncode == 0, done
-    for name, (_, bits) in kinds.items():
-        samples = as_int32(signals[name])
-        assert np.all(samples % 2 ** (32 - bits) == 0)
-        expected = process(samples, 16000, parameters=SMALL_PARAMETERS, outputs=["input", "ild"])
-        assert_equal((tmp_path / name).with_suffix(".npz"), expected)
-
-
 def test_settings_and_blocks(tmp_path: Path) -> None:
     samples = np.random.default_rng(3).integers(-(2**30), 2**30, (2, 20000)).astype(np.int32)
     path = write(tmp_path / "in.wav", samples, 16000, "PCM_32")

@@ -3,7 +3,7 @@
 tests/dsp/test_sanitizers.py builds the kernels in FOLDER and starts this program. COMMAND:
 
     pytest ARGUMENT...   run pytest
-    fuzz CASES           process random blocks by random stages
+    fuzz CASES [ARGUMENT...]   run pytest with the arguments, if there are any, and process random blocks
     overflow             write beyond an array, which the sanitizer must report
 """
 
@@ -198,7 +198,10 @@ def main(arguments: list[str]) -> int:
     assert kernels.compiled(), kernels.status().detail
     assert folder in kernels.status().detail
     if command == "fuzz":
-        fuzz(int(rest[0]))
+        cases, *tests = rest
+        if tests and (status := int(pytest.main(tests))):
+            return status
+        fuzz(int(cases))
     else:
         overflow()
     return 0

@@ -23,7 +23,6 @@ from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.dsp.windows import NAMES
 from rosafe.localization import cues, mixture
-from rosafe.localization.direction_model import TABLES, DirectionModel
 from rosafe.localization.evidence import EvidenceWindow
 from rosafe.representations import STAGES, precedence
 from rosafe.representations.amsfeatures import AmsFeatures
@@ -33,6 +32,7 @@ from rosafe.representations.ild import Ild
 from rosafe.representations.ratemap import Ratemap
 from rosafe.representations.registry import CORE_KINDS
 from tests.harness import ROOT
+from tests.models import random_model
 
 from . import foreign
 from .bare import FloatArray, cut, single
@@ -539,23 +539,6 @@ def test_the_processor_check_uses_no_newer_instructions() -> None:
     assert not newer
 
 
-def direction_model(channels: int, rng: np.random.Generator) -> DirectionModel:
-    """Return a model with random tables."""
-    description = {
-        "sample_rate": RATE,
-        "parameters": {"fb_cfHz": np.linspace(100, 4000, channels)},
-        "head": "",
-        "is_sphere": True,
-        "max_itd": 1e-3,
-        "level_gain_db": 0.0,
-    }
-    rows = channels * cues.CLASSES
-    tables = [rng.normal(0, 1, (rows * bins + 1, kernels.DIRECTIONS + 1)) for bins in TABLES.values()]
-    for table in tables:
-        table[-1] = 0.0
-    return DirectionModel(description, *tables)
-
-
 def random_cues(frames: int, channels: int, rng: np.random.Generator) -> cues.Cues:
     """Return cues with levels on both sides of those of all classes, and on their limits."""
     first = np.arange(channels) * cues.CLASSES + cues.LEVEL_CLASSES * rng.integers(
@@ -574,7 +557,7 @@ def random_cues(frames: int, channels: int, rng: np.random.Generator) -> cues.Cu
 def test_evidence(yaw: float | None, level: Choice) -> None:
     """The sums and the evidence of units are equal to the last bit, with parts of all sizes."""
     rng = np.random.default_rng(1)
-    model = direction_model(5, rng)
+    model = random_model(5, rng)
     both = EvidenceWindow(model, 50), EvidenceWindow(model, 50)
     for frames in [1, 1, 3, 10, 10, 30, 10, 1, 10, 60, 10]:
         new = random_cues(frames, 5, rng)

@@ -127,12 +127,9 @@ def test_an_overflow_is_reported(newest: Sanitized) -> None:
     assert "heap-buffer-overflow" in done.stderr and "rosafe_concatenate" in done.stderr, done.stderr[-3000:]
 
 
-def test_kernels_pass_their_tests(newest: Sanitized) -> None:
-    passed(newest.run(*PYTEST, "-k", SELECTED))
-
-
-def test_random_blocks(newest: Sanitized) -> None:
-    passed(newest.run("fuzz", "200"))
+def test_kernels_pass_their_tests_and_process_random_blocks(newest: Sanitized) -> None:
+    """In one process, as it takes seconds to start one with sanitizers."""
+    passed(newest.run("fuzz", "200", *PYTEST[1:], "-k", SELECTED))
 
 
 @pytest.mark.exploration

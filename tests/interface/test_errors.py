@@ -107,11 +107,6 @@ def test_parse_only_raises_value_error_with_the_name(text: str) -> None:
                 assert str(problem).startswith(f"{parameter.name}: ")
 
 
-@given(st.floats(1e-6, 60))
-def test_parse_reads_the_repr_of_a_number(value: float) -> None:
-    assert KINDS["ild"].parameter("ild_wSizeSec").parse(f" {value!r} ") == value
-
-
 def test_an_unpaired_surrogate_crosses_the_wire() -> None:
     text = ROSAFE.error("e_badNewValue", what="\udc80 ü").exdetail
     assert json.loads(text.encode().decode())["detail"]["what"] == "\udc80 ü"

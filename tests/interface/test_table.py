@@ -1,14 +1,15 @@
-"""The interface table and the .msg, .srv and .action files have the same fields."""
+"""The interface table: types, defaults, tasks and exceptions, and the fields of messages of ROS 2.
+
+test_files.py compares the .msg, .srv and .action files with it, test_md5.py their sums with those of the original.
+"""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pytest
 
-import rosafe
 from rosafe import interface
 from rosafe.declarations.idl import SCALARS
 from rosafe.interface import BASS, ROSAFE, ComponentSpec, Service
@@ -16,7 +17,6 @@ from tests import harness
 
 FOLDERS = {"rosAFE": harness.ROOT, "bass": harness.ROOT / "bass"}
 OF_ROS_2 = harness.ROOT / "ros2" / "rosafe_msgs"
-REPLY = [("bool", "genom_success"), ("string", "genom_exdetail")]
 COMPONENTS = pytest.mark.parametrize("component", interface.COMPONENTS.values(), ids=lambda c: c.name)
 SERVICES = pytest.mark.parametrize(("component", "service"), list(interface.all_services()), ids=lambda x: x.name)
 
@@ -32,47 +32,6 @@ def parts(path: Path) -> list[list[tuple[str, str]]]:
             kind, name = line.split()
             found[-1].append((kind, name))
     return found
-
-
-def names(component: ComponentSpec, kind: str) -> set[str]:
-    return {path.stem for path in (FOLDERS[component.name] / kind).glob(f"*.{kind}")}
-
-
-@SERVICES
-def test_srv(component: ComponentSpec, service: Service) -> None:
-    request = [(interface.ros_type(p.idl), p.name) for p in service.parameters]
-    outputs = [(interface.ros_type(idl), name) for name, idl in service.outputs]
-    assert parts(FOLDERS[component.name] / "srv" / f"{service.name}.srv") == [request, REPLY + outputs]
-
-
-@SERVICES
-def test_action(component: ComponentSpec, service: Service) -> None:
-    path = FOLDERS[component.name] / "action" / f"{service.name}.action"
-    assert path.exists() == service.activity
-    if service.activity:
-        assert parts(path) == [[(interface.ros_type(p.idl), p.name) for p in service.parameters], REPLY, []]
-
-
-@COMPONENTS
-def test_msg(component: ComponentSpec) -> None:
-    for idl, fields in component.structs.items():
-        path = FOLDERS[component.name] / "msg" / f"{interface.ros_type(idl)}.msg"
-        assert parts(path) == [[(interface.ros_type(kind), name) for name, kind in fields]], idl
-
-
-@COMPONENTS
-def test_no_file_is_without_an_entry(component: ComponentSpec) -> None:
-    structs = {interface.ros_type(idl) for idl in component.structs}
-    assert names(component, "msg") == structs | set(component.messages)
-    assert names(component, "srv") == {s.name for s in component.on_graph}
-    assert names(component, "action") == {s.name for s in component.activities}
-
-
-@COMPONENTS
-def test_cmake_lists_every_file(component: ComponentSpec) -> None:
-    text = (FOLDERS[component.name] / "CMakeLists.txt").read_text("utf-8").split()
-    for kind in ("msg", "srv", "action"):
-        assert {word.removesuffix(f".{kind}") for word in text if word.endswith(f".{kind}")} == names(component, kind)
 
 
 @COMPONENTS
@@ -169,13 +128,6 @@ def test_exceptions() -> None:
             _, owner, short = thrown.split("::")
             known = interface.GENOM_EXCEPTIONS if owner == "genom" else component.exceptions
             assert short in known, f"{service.name} throws {thrown}"
-
-
-@pytest.mark.parametrize("name", ["rosAFE", "bass", "rosafe_msgs"])
-def test_version_is_that_of_the_package(name: str) -> None:
-    manifest = ElementTree.parse(FOLDERS.get(name, harness.ROOT / "ros2" / name) / "package.xml")
-    assert manifest.findtext("version") == rosafe.__version__
-    assert manifest.findtext("name") == name
 
 
 @pytest.mark.parametrize(

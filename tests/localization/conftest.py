@@ -1,4 +1,4 @@
-"""A small direction model of the sphere at 16 kHz, and a cache of models of its own."""
+"""Direction models at 16 kHz of the sphere, of the MIT KEMAR head and of two microphones."""
 
 from __future__ import annotations
 
@@ -49,8 +49,16 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
 
 
 @pytest.fixture(scope="session")
+def kemar() -> Head:
+    """Return the MIT KEMAR head."""
+    if not KEMAR.exists():
+        pytest.skip("Debian's libmysofa1 is not installed")
+    return Head.from_sofa(KEMAR)
+
+
+@pytest.fixture(scope="session")
 def kemar_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the file of a model of the MIT KEMAR head.
+    """Return the file of a model of the MIT KEMAR head, learned from as much sound as usual, which rooms need.
 
     The first process of a run of the tests that needs it learns it.
     """
@@ -65,11 +73,9 @@ def kemar_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def kemar() -> Head:
-    """Return the MIT KEMAR head."""
-    if not KEMAR.exists():
-        pytest.skip("Debian's libmysofa1 is not installed")
-    return Head.from_sofa(KEMAR)
+def pair_model(tmp_path_factory: pytest.TempPathFactory) -> DirectionModel:
+    """Return the model of microphones with a distance of 58 mm, learned from less sound than usual."""
+    return models.learn(tmp_path_factory, RATE, head=Head.pair(0.058))
 
 
 def modulated(seconds: float, seed: int, rate: int = RATE) -> np.ndarray:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from rosafe.dsp.kernels import EvidenceTables
-from rosafe.localization import angles
 from rosafe.localization.cues import CLASSES, ILD_BINS, ITD_BINS, LEVEL_CLASSES, Cues, floors
-from rosafe.localization.direction_model import TABLES, DirectionModel, Histograms
+from rosafe.localization.direction_model import DirectionModel, Histograms
 from rosafe.localization.evidence import EvidenceWindow, rotate
+from tests.models import random_model
 
 CHANNELS, LENGTH, FRAMES = 3, 40, 170
 RANDOM = np.random.default_rng(5)
@@ -24,19 +24,7 @@ YAW = {
 @pytest.fixture(scope="module")
 def model() -> DirectionModel:
     """Return a model whose tables are random."""
-    rows = CHANNELS * CLASSES
-    description = {
-        "sample_rate": 16000,
-        "parameters": {"fb_cfHz": np.linspace(100.0, 4000.0, CHANNELS)},
-        "head": "random",
-        "is_sphere": False,
-        "max_itd": 1e-3,
-        "level_gain_db": 0.0,
-    }
-    tables = [RANDOM.standard_normal((rows * bins + 1, len(angles.grid()) + 1)) for bins in TABLES.values()]
-    for table in tables:
-        table[-1] = 0.0  # of frames without cues
-    return DirectionModel(description, *tables)
+    return random_model(CHANNELS, RANDOM)
 
 
 def random_cues() -> Cues:

@@ -28,7 +28,6 @@ from tests.localization.test_head import write_sofa
 from tests.results.damage import change, forked
 
 MEMORY = 600  # MiB, of which the libraries take 100
-PARAMETERS = {"fb_cfHz": None, "fb_nChannels": 3}
 __all__ = ["forked"]
 
 
@@ -357,6 +356,9 @@ def test_a_damaged_entry_is_replaced(tmp_path: Path, learned: list[str]) -> None
     good = path.read_bytes()
     _model()
     assert len(learned) == 1
+    for sample_rate in (8000, 8000.0):
+        model_cache.model_of(rosafe.Head.sphere(), sample_rate, {"fb_nChannels": 3})
+    assert len(learned) == 1
     for damage in (lambda: path.write_bytes(good[:1000]), lambda: _absurd_shape(path), lambda: _other_head(path)):
         damage()
         count = len(learned)
@@ -412,6 +414,11 @@ def test_models_that_other_users_could_have_written_are_not_used(
     if "file" not in part:
         assert (path.read_bytes(), path.stat().st_mtime_ns) == before
         assert noise.default_path() is None
+
+
+def test_a_cache_that_cannot_be_written_is_ignored(monkeypatch: pytest.MonkeyPatch, learned: list[str]) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null/none")
+    assert _model().channels == 3 and len(learned) == 1
 
 
 def test_without_a_home_there_is_no_cache(monkeypatch: pytest.MonkeyPatch, learned: list[str]) -> None:

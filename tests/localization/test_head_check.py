@@ -11,7 +11,6 @@ import soundfile
 
 import rosafe
 from rosafe.commands.__main__ import main
-from rosafe.localization import training
 from rosafe.localization.cues import KINDS
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.head_check import HeadCheck, HeadReport, check_sound
@@ -37,13 +36,6 @@ def walk(head: rosafe.Head, azimuths: np.ndarray = WALK, drr_db: float | None = 
         parts.append(ears)
     ears = np.concatenate(parts, axis=1)
     return ears + 2e-4 * random.standard_normal(ears.shape)
-
-
-@pytest.fixture(scope="module")
-def pair_model() -> DirectionModel:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "SOUND_SECONDS", 40.0)
-        return training.learn_head(rosafe.Head.pair(0.058), RATE)
 
 
 def checked(sound: np.ndarray, model: DirectionModel | Path) -> HeadReport:
@@ -99,7 +91,7 @@ def test_delays_that_a_head_does_not_allow(sphere_model: Path) -> None:
     assert problem.endswith("recordings of this head (rosafe head learn)")
 
 
-@pytest.mark.parametrize("gain_db", [-3.0, 2.5, 3.0])
+@pytest.mark.parametrize("gain_db", [-3.0, 2.5])
 def test_gains(sphere_model: Path, pair_model: DirectionModel, gain_db: float) -> None:
     for head, model in ((rosafe.Head.sphere(), sphere_model), (rosafe.Head.pair(0.058), pair_model)):
         report = checked(walk(head) * np.array([[10 ** (gain_db / 20)], [1.0]]), model)
@@ -119,7 +111,7 @@ def test_levels_that_contradict_the_times(sphere_model: Path) -> None:
     assert checked(contrary, sphere_model).problem.startswith("times and levels contradict each other")
 
 
-@pytest.mark.parametrize("azimuths", [[20], [60], [0], [-10, 30]])
+@pytest.mark.parametrize("azimuths", [[60], [0], [-10, 30]])
 def test_few_directions_give_no_alarm(sphere_model: Path, azimuths: list[int]) -> None:
     for drr_db in (None, 0.0):
         sound = walk(rosafe.Head.sphere(), np.repeat(azimuths, 16 // len(azimuths)), drr_db)

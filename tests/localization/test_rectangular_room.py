@@ -138,18 +138,6 @@ def test_reflections_stay_in_the_world_when_the_head_turns(tmp_path: Path) -> No
     assert np.abs((moved - static)[:, : RATE // 2]).max() > 0.01
 
 
-def test_a_room_depends_on_the_seed_and_not_on_chunks(tmp_path: Path) -> None:
-    text = (
-        "seed: {}\nroom: {{rt60: 0.3, drr_db: 0}}\nhead_yaw: [[0, 0], [1, 30]]\nnoise: {{snr_db: 10}}\n"
-        "sources: [{{signal: noise, azimuth: [[0, 0], [1, 90]]}}, {{signal: vowel, start: 0.2, end: 0.3}}]"
-    )
-    whole = scene(tmp_path, text.format(5)).frames(30000)
-    renderer = scene(tmp_path, text.format(5))
-    pieces = [renderer.frames(count) for count in (1, 4095, 10000, 15904)]
-    assert np.array_equal(np.concatenate(pieces, axis=1), whole)
-    assert not np.array_equal(scene(tmp_path, text.format(6)).frames(30000), whole)
-
-
 @pytest.mark.parametrize(
     ("room", "message"),
     [

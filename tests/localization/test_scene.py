@@ -42,10 +42,11 @@ def test_a_static_source_is_the_rendered_signal(tmp_path: Path) -> None:
     assert np.allclose(ears, rosafe.Head.sphere().render(scaled, RATE, 40), atol=1e-6)
 
 
-def test_samples_do_not_depend_on_chunks_and_repeat(tmp_path: Path) -> None:
+@pytest.mark.parametrize("room", ["", "room: {rt60: 0.3, drr_db: 0}, "])
+def test_samples_do_not_depend_on_chunks_and_repeat(tmp_path: Path, room: str) -> None:
     path = scene_file(
         tmp_path,
-        "{seed: 5, noise: {snr_db: 10}, head_yaw: [[0, 0], [1, 30]], sources: ["
+        f"{{seed: 5, {room}noise: {{snr_db: 10}}, head_yaw: [[0, 0], [1, 30]], sources: ["
         "{signal: noise, azimuth: [[0, 0], [1, 90]]}, {signal: vowel, start: 0.2, end: 0.3}]}",
     )
     whole = SceneRenderer(read_scene(path)).frames(30000)

@@ -15,11 +15,13 @@ from scipy.spatial.transform import Rotation
 import rosafe
 from rosafe.commands.__main__ import main
 from rosafe.localization import angles, settings, training
+from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.horizontal_plane import near_ear_gain
 from rosafe.localization.scene import SceneRenderer
 from rosafe.localization.scene_file import SceneError, read_scene
 from rosafe.localization.sofa import read_sofa
 from tests.harness import shared
+from tests.models import random_model
 
 h5py = pytest.importorskip("h5py")
 DEGREE = "degree, degree, metre"
@@ -92,7 +94,7 @@ def _clockwise(lab: Laboratory) -> None:
     lab.source[:, 0] = -lab.source[:, 0] % 360
 
 
-@pytest.mark.parametrize("rate", [8000.0, 16000.0, 44100.0, 96000.0])
+@pytest.mark.parametrize("rate", [8000.0, 96000.0])
 @pytest.mark.parametrize(
     ("change", "correction"), [(_right_ear_first, "the ears are exchanged"), (_clockwise, "the azimuths are negated")]
 )
@@ -189,6 +191,8 @@ def test_scenes_with_a_front_half(tmp_path: Path, azimuth: str, problem: str) ->
 
 def test_the_model_of_a_front_half_is_equal_front_and_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "SOUND_SECONDS", 60.0)
+    monkeypatch.setattr(training, "SNR_DB", (30.0, 10.0))
+    monkeypatch.setattr(training, "ROOM_SNR_DB", (30.0,))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     lab = Laboratory(np.arange(-90, 91, 5.0), 16000.0)
     lab.responses *= np.array([[1.0], [1.2]])  # not symmetric: each side is learned
@@ -366,18 +370,22 @@ def test_the_option_of_head_learn(
     option: tuple[str, ...],
     corrected: bool,
 ) -> None:
-    monkeypatch.setattr(training, "SOUND_SECONDS", 30.0)
-    lab = Laboratory(np.arange(0, 360, 15.0), 16000.0)
-    lab.responses[:, 1] *= 1.1  # not symmetric
-    path = lab.write(tmp_path / "right.sofa")
-    head = rosafe.Head.from_sofa(path)
+    """The head that is learned; other tests learn models by this command."""
+    learned: list[rosafe.Head] = []
+
+    def learn(head: rosafe.Head, *_: Any) -> DirectionModel:
+        learned.append(head)
+        return random_model(3, np.random.default_rng(1))
+
+    monkeypatch.setattr(training, "learn_head", learn)
+    lab = Laboratory()
+    right = rosafe.Head.from_sofa(lab.write(tmp_path / "a.sofa"))
     _right_ear_first(lab)
-    lab.write(path)
+    path = lab.write(tmp_path / "a.sofa")
     assert main(["head", "learn", str(path), "-o", str(tmp_path / "a.head"), "--rate", "16000", *option]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert [line.startswith("rosafe head: ") for line in lines] == ([True, False] if not option else [False])
-    model = rosafe.localization.direction_model.DirectionModel.load(tmp_path / "a.head")
-    assert (model.head == head.key) is corrected
+    assert [head.key == right.key for head in learned] == [corrected]
 
 
 def test_the_setting_of_the_node() -> None:

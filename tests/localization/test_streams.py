@@ -23,9 +23,10 @@ from rosafe.localization.mixture import Candidate
 from rosafe.localization.streams import RATE, SourcePart, SourceStreams
 from rosafe.localization.tracker import Track
 from rosafe.ros1.transport.paths import PYPI_DIR
+from rosafe.validation.systems import si_sdr
 from tests.localization.conftest import modulated
 from tests.localization.sounds import RECORDINGS, music
-from tests.localization.test_enhancement import si_sdr, talkers
+from tests.localization.test_enhancement import talkers
 
 
 def track(id_: int, azimuth: float, velocity: float = 0.0, log_odds: float = 2.0) -> Track:

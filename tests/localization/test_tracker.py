@@ -173,10 +173,3 @@ def test_two_talkers(kemar_model: Path, kemar: rosafe.Head) -> None:
     tracks = rosafe.localize(sound, RATE, kemar_model)["tracks"]
     azimuths = sorted(float(np.median(track["azimuth"])) for track in tracks if len(track["time"]) > 20)
     assert len(azimuths) == 2 and np.allclose(azimuths, [-20, 40], atol=10)
-
-
-def test_a_source_that_stops_is_forgotten(kemar_model: Path, kemar: rosafe.Head) -> None:
-    source = modulated(4.0, 1)
-    source[2 * RATE :] = 0
-    (track,) = rosafe.localize(kemar.render(source, RATE, 60), RATE, kemar_model)["tracks"]
-    assert track["time"][track["probability"] > 0.5][-1] < 3.0

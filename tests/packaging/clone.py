@@ -26,12 +26,21 @@ MESSAGES = ("rosAFE_signalOneD",)  # kept, with those that `REQUESTS` need
 
 
 @contextmanager
-def fresh_copy() -> Iterator[Path]:
-    """Yield a copy of the checkout, like a new clone, in a folder that every user can read."""
+def fresh_copy(*names: str) -> Iterator[Path]:
+    """Yield a copy of the checkout, or of these files and folders, in a folder that every user can read.
+
+    It is like a new clone, or, if names are given, has the compiled modules of this checkout.
+    """
     with tempfile.TemporaryDirectory(prefix="rosafe-test-") as folder:
         Path(folder).chmod(0o755)
         copy = Path(folder, "a checkout")  # the name contains a blank
-        shutil.copytree(ROOT, copy, ignore=EXCLUDED, symlinks=True)
+        if not names:
+            shutil.copytree(ROOT, copy, ignore=EXCLUDED, symlinks=True)
+        for name in names:
+            if (ROOT / name).is_dir():
+                shutil.copytree(ROOT / name, copy / name, symlinks=True)
+            else:
+                shutil.copy2(ROOT / name, copy / name)
         yield copy
 
 

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(platform.machine() != "x86_64", reason="other pr
 
 @pytest.fixture
 def copy() -> Iterator[Path]:
-    with fresh_copy() as path:
+    with fresh_copy("rosafe", "pyproject.toml") as path:
         yield path
 
 

@@ -86,7 +86,3 @@ def test_files_do_not_import_each_other() -> None:
     imported = {module: set(imports(module, always=True)) for module in MODULES}
     found = {(a, b) for a in imported for b in imported[a] if a < b and a in imported[b]}
     assert not {pair for pair in found if "__init__" not in {MODULES[name].stem for name in pair}}
-
-
-def test_every_module_has_a_docstring() -> None:
-    assert not [name for name, path in MODULES.items() if not ast.get_docstring(ast.parse(path.read_text("utf-8")))]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import itertools
 import tracemalloc
 from collections import deque
 from collections.abc import Iterator
@@ -99,14 +98,10 @@ def test_a_sample_rate_that_is_too_low_for_the_channels() -> None:
         ({"set_rm_scailing": "_power"}, "^parameters: expected a known parameter, got "),
         ({5: 1}, "^parameters: expected a known parameter, got 5"),
         ([("fb_nERBs", 1)], "parameters: expected a dict of names and values, got list"),
-        ({"fb_nERBs": "1"}, "fb_nERBs: expected a finite number, got '1'"),
         ({"fb_nERBs": 1e-3}, "fb_nERBs: expected a distance that gives at most 1024 channels, got 0.001"),
         ({"fb_lowFreqHz": 9000.0}, r"fb_lowFreqHz: expected less than fb_highFreqHz \(.* Hz\), got 9000 Hz"),
         ({"fb_cfHz": np.ma.masked}, "fb_cfHz: expected a finite number, got nan"),
-        ({"fb_cfHz": "100"}, "fb_cfHz: expected a list of double, got '100'"),
-        ({"fb_cfHz": itertools.count(1)}, "fb_cfHz: expected at most 1024 values, got more"),
         ({"pp_bRemoveDC": True, "pp_cutoffHzDC": 8000}, "pp_cutoffHzDC: expected less than half .*, got 8000 Hz"),
-        ({"pp_middleEarModel": "human"}, "pp_middleEarModel: expected one of jepsen, lopezpoveda, got 'human'"),
         ({"ild_wSizeSec": 1e-6}, "ild_wSizeSec: expected at least one sample"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Changes of every parameter during the sound: which processors are reset, which continue, which are unaffected."""
+"""Changes of every parameter during the sound: which processors are affected; tests/dsp has the resets of stages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 import rosafe
 from rosafe.interface import CORE_REPRESENTATIONS
-from rosafe.representations import STAGES
 from tests.dsp.bare import cut
 from tests.representations.chain import core_chain
 
@@ -93,13 +92,6 @@ def test_a_change_of(name: str, unchanged: dict[str, Any]) -> None:
         after = np.concatenate([output[other] for output in outputs[AT:]], axis=-1)
         np.testing.assert_array_equal(inner(other, got[other], after.shape)[..., -after.shape[-1] :], after)
 
-    if kind in ("input", "preProc", "gammatone"):  # these are reset
-        values = {key: value for key, value in {**BASE, name: CHANGES[name]}.items() if KIND_OF[key] == kind}
-        stage = STAGES[kind](RATE, **values)
-        taken = got[CORE_REPRESENTATIONS[kind].parent] if kind != "input" else SOUND
-        restarted = np.concatenate([stage.process(block) for block in cut(taken[..., AT * BLOCK :], BLOCK)], axis=-1)
-        np.testing.assert_array_equal(inner(kind, got[kind], restarted.shape)[..., AT * BLOCK :], restarted)
-
 
 def inner(kind: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     """Return the part of an output for this shape; the rest belongs to other numbers of channels and lags."""
@@ -112,12 +104,3 @@ def inner(kind: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any
 
 def test_every_parameter_is_covered() -> None:
     assert CHANGES.keys() == KIND_OF.keys()
-
-
-def test_values_that_apply_to_no_block_do_not_affect_the_result() -> None:
-    """After a change before the first block, the number of channels is the new one, although the old one was larger."""
-    sound = np.random.default_rng(8).standard_normal((2, 500))
-    changed = rosafe.process(sound, 44100, modifications=[(0, "fb_nChannels", 3)], outputs=["gammatone"])
-    np.testing.assert_array_equal(
-        changed["gammatone"], rosafe.process(sound, 44100, parameters={"fb_nChannels": 3})["gammatone"]
-    )

@@ -19,12 +19,13 @@ import pytest
 import rosafe
 import rosafe.plugin
 from rosafe.interface import KINDS
-from rosafe.localization import cues, model_cache
-from rosafe.localization.direction_model import TABLES, DirectionModel
+from rosafe.localization import model_cache
+from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.scene import SceneRenderer
 from rosafe.localization.scene_file import read_scene
 from rosafe.representations import STAGES
 from tests.localization.test_head import write_sofa
+from tests.models import random_model
 from tests.plugins.stages import FACTOR, FRAMED, HEAD
 from tests.plugins.support import python
 from tests.representations.chain import Chain
@@ -77,18 +78,7 @@ def _other(name: str, folder: Path) -> rosafe.Stream:
 
 
 def _model() -> DirectionModel:
-    """Return a model with random tables."""
-    described = rosafe.Stream(RATE, {"fb_nChannels": 4}, list(cues.KINDS)).describe()
-    rows, random = 4 * cues.CLASSES, np.random.default_rng(4)
-    tables = [random.standard_normal((rows * bins + 1, 73)) / 4 for bins in TABLES.values()]
-    about = {
-        "sample_rate": RATE,
-        "parameters": described["parameters"],
-        "head": "",
-        "max_itd": 1e-3,
-        "level_gain_db": 0.0,
-    }
-    return DirectionModel({**about, "is_sphere": False}, *tables)
+    return random_model(4, np.random.default_rng(4))
 
 
 def _scene(folder: Path) -> SceneRenderer:

@@ -128,27 +128,6 @@ def test_blocks_without_frames_have_rows_too() -> None:
     assert not got["crossCorrelation"][:, :10].any()
 
 
-@pytest.mark.parametrize(
-    ("kind", "names", "shape"),
-    [
-        ("itd", {"fb_cfHz", "cc_lags"}, (4, 17)),
-        ("autocorrelation", {"fb_cfHz", "ac_lags"}, (2, 4, 319, 17)),
-        ("pitch", {"fb_cfHz", "ac_lags"}, (2, 3, 16)),
-        ("spectralFeatures", {"fb_cfHz", "sf_requests"}, (2, 14, 17)),
-        ("onsetStrength", {"fb_cfHz"}, (2, 4, 17)),
-        ("adaptation", {"fb_cfHz"}, (2, 4, 3000)),
-    ],
-)
-def test_later_kinds(kind: str, names: set[str], shape: tuple[int, ...]) -> None:
-    """Results contain the coordinates of all computed kinds, and the frame rate of the requested one."""
-    got = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=333, outputs=[kind])
-    rate = set() if kind == "adaptation" else {f"{kind}_frameRate"}
-    assert set(got) == {kind, f"{kind}_time"} | names | rate
-    assert got[kind].shape == shape
-    whole = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=3000, outputs=kind)
-    np.testing.assert_allclose(got[kind], whole[kind], rtol=1e-9, atol=1e-9 * np.nanmax(np.abs(whole[kind])))
-
-
 def test_names_are_a_list() -> None:
     got = rosafe.process(
         SOUND, RATE, parameters={**FEW, "sf_requests": ["flux", "centroid"]}, outputs=["spectralFeatures"]
@@ -186,9 +165,3 @@ def test_a_change_that_a_child_cannot_follow_is_refused() -> None:
     ):
         rosafe.process(SOUND, RATE, **changed, outputs=["pitch"])
     rosafe.process(SOUND, RATE, **changed, outputs=["autocorrelation"])
-
-
-def test_the_original_kinds_are_the_default() -> None:
-    got = rosafe.process(SOUND[:, :400], RATE, parameters=FEW)
-    kinds = [name for name in got if name in KINDS]
-    assert kinds == ["input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation"]

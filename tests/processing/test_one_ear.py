@@ -94,9 +94,3 @@ def test_plugins_get_two_equal_ears(monkeypatch: pytest.MonkeyPatch, rows: set[i
     result = rosafe.process(SOUND[0], RATE, outputs="ratemap")
     assert rows == {2}
     np.testing.assert_array_equal(result["ratemap"], expected["ratemap"])
-
-
-def test_a_stage_rejects_another_number_of_ears() -> None:
-    stage = STAGES["preProc"](RATE)
-    with pytest.raises(ValueError, match=r"block: expected numbers of shape \(2 ears, samples\), got float64 of shape"):
-        stage.process(np.zeros((1, 10)))

@@ -16,7 +16,6 @@ import pytest
 from numpy.typing import NDArray
 
 import rosafe
-from rosafe.audio.files.audiofile import AudioFile
 from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.processing import chain
 from rosafe.representations import STAGES
@@ -44,20 +43,6 @@ def assert_same(got: dict[str, Any], wanted: dict[str, Any], tolerance: float = 
 
 
 # --- numbers ---
-
-
-def test_speech_comes_from_one_side() -> None:
-    """Level and time differences have the same sign."""
-    file = AudioFile(harness.shared("audio", "speech_anechoic_16k.wav"))
-    results = rosafe.process(file.read(2 * file.sample_rate), file.sample_rate, outputs=FRAMED)
-    file.close()
-    loud = results["ratemap"].sum(axis=0)
-    loud = loud > 0.05 * loud.max()
-    level = np.median(results["ild"][loud])
-    lag = results["cc_lags"][results["crossCorrelation"].mean(axis=0)[:, loud.any(axis=0)].mean(axis=1).argmax()]
-    assert abs(level) > 2
-    assert abs(lag) > 1e-4
-    assert (level > 0) == (lag > 0)
 
 
 def test_keys_shapes_and_types() -> None:
@@ -89,13 +74,6 @@ def test_keys_shapes_and_types() -> None:
     assert all(np.asarray(value).dtype == np.float64 for value in results.values())
     np.testing.assert_allclose(results["cc_lags"], np.arange(-18, 19) / RATE)
     assert [results[f"{kind}_frameRate"] for kind in FRAMED] == [100.0] * 3
-
-
-def test_frame_rates_follow_from_the_rounded_hop() -> None:
-    results = rosafe.process(
-        noise(4410), 44100, parameters={"ild_hSizeSec": 0.0125, "rm_hSizeSec": 0.003, "cc_hSizeSec": 0.007}
-    )
-    assert [results[f"{kind}_frameRate"] for kind in FRAMED] == [44100 / 551, 44100 / 132, 44100 / 309]
 
 
 def test_integers_are_normalised_and_floats_are_not() -> None:
@@ -164,13 +142,11 @@ def test_less_than_a_window(frames: int, block: int) -> None:
     assert results["ild_frameRate"] == 100.0
 
 
-def test_one_whole_window() -> None:
-    assert rosafe.process(noise(320), RATE, parameters=FEW)["ild"].shape == (4, 1)
-
-
 def test_silence() -> None:
     results = rosafe.process(
-        np.zeros((2, 3000)), RATE, parameters={**FEW, "pp_bNormalizeRMS": True, "ihc_method": "bernstein"}
+        np.zeros((2, 3000)),
+        RATE,
+        parameters={**FEW, "pp_bNormalizeRMS": True, "pp_bMiddleEarFiltering": True, "ihc_method": "bernstein"},
     )
     for name in ("preProc", "gammatone", "ihc", *FRAMED):
         assert not results[name].any(), name

@@ -120,7 +120,6 @@ def test_a_stream_with_the_described_parameters_is_equal() -> None:
     ("arguments", "match"),
     [
         ((0,), "sample_rate: expected a number .*, got 0"),
-        ((RATE, {"fb_nChanels": 3}), r"'fb_nChanels'; did you mean fb_nChannels\?"),
         ((RATE, {"fb_highFreqHz": 9000.0}), "use at most 7600 Hz"),
         ((RATE, None, ["ratemaps"]), r"'ratemaps'; did you mean ratemap\?"),
         ((96000, {"ild_wSizeSec": 60.0}), "expected at most 1024 MiB"),

@@ -47,18 +47,18 @@ def by_the_book(x: FloatArray, threshold_db: float, tau: list[float], lim: float
     return made
 
 
-@pytest.mark.parametrize("drnl", [False, True])
 @pytest.mark.parametrize(
-    "parameters",
+    ("parameters", "drnl"),
     [
-        {},
-        {"adpt_lim": 0.0},
-        {"adpt_lim": 1.0, "adpt_mindB": 40.0},
-        {"adpt_lim": 1.4, "adpt_mindB": 99.0},  # all m below 0
-        {"adpt_lim": 1.2},  # of the last loops
-        {"adpt_lim": 1e6, "adpt_mindB": -300.0},
-        {"adpt_lim": 5.0, "adpt_tau": [0.001]},
-        {"adpt_lim": 3.0, "adpt_tau": [3600.0, 1e-3, 0.02, 1e-3, 0.1, 0.5, 2.0, 1e-4, 1e-5]},
+        ({}, True),
+        ({}, False),
+        ({"adpt_lim": 0.0}, False),
+        ({"adpt_lim": 1.0, "adpt_mindB": 40.0}, True),
+        ({"adpt_lim": 1.4, "adpt_mindB": 99.0}, False),  # all m below 0
+        ({"adpt_lim": 1.2}, False),  # of the last loops
+        ({"adpt_lim": 1e6, "adpt_mindB": -300.0}, False),
+        ({"adpt_lim": 5.0, "adpt_tau": [0.001]}, False),
+        ({"adpt_lim": 3.0, "adpt_tau": [3600.0, 1e-3, 0.02, 1e-3, 0.1, 0.5, 2.0, 1e-4, 1e-5]}, False),
     ],
     ids=str,
 )

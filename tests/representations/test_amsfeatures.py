@@ -11,8 +11,8 @@ import pytest
 import scipy
 
 from rosafe.dsp.signal_format import SignalFormat
-from rosafe.dsp.windows import ALL_NAMES, window
-from rosafe.representations.amsfeatures import AmsFeatures, design_sections
+from rosafe.dsp.windows import window
+from rosafe.representations.amsfeatures import AmsFeatures
 
 from .chain import FloatArray, cut
 
@@ -81,8 +81,9 @@ def test_centres(values: dict[str, Any], centres: list[float]) -> None:
     assert AmsFeatures.effective_values({**AmsFeatures(RATE).parameters, "ams_cfHz": [], **values}) == stage.parameters
 
 
-@pytest.mark.parametrize("name", ALL_NAMES)
-@pytest.mark.parametrize(("size", "hop", "ratio"), [(64, 32, 4), (50, 71, 1), (130, 11, 7)])
+@pytest.mark.parametrize(
+    ("size", "hop", "ratio", "name"), [(64, 32, 4, "hann"), (50, 71, 1, "rectwin"), (130, 11, 7, "triang")]
+)
 def test_log_equals_filters_of_scipy(size: int, hop: int, ratio: int, name: str) -> None:
     centres = [40.0, 4.0, 30.0, 200.0, 3.0] + [25.0 * 1.2**i for i in range(14)]  # the first is always a low-pass
     x = sound(3001)
@@ -92,24 +93,13 @@ def test_log_equals_filters_of_scipy(size: int, hop: int, ratio: int, name: str)
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10 * expected.max())
 
 
-def test_sections_equal_those_of_scipy() -> None:
-    frequencies = np.array([5.0, 1e-3, 0.7, 4.0, 64.0, 1024.0, 2400.0])
-    made = design_sections(frequencies, 8000.0)
-    expected = [scipy.signal.butter(1, 5.0, fs=8000.0, output="sos")[0]]
-    for f in frequencies[1:]:
-        expected.append(scipy.signal.butter(1, [f / GOLDEN, f * GOLDEN], "bandpass", fs=8000.0, output="sos")[0])
-    np.testing.assert_allclose(made, expected, rtol=1e-9, atol=1e-12)
-    for section, f in zip(made[3:], frequencies[3:], strict=True):  # Q is 1: 3 dB down at edges with a distance of f
-        _, gains = scipy.signal.sosfreqz(section[np.newaxis], [f / GOLDEN, f * GOLDEN], fs=8000.0)
-        np.testing.assert_allclose(np.abs(gains), math.sqrt(0.5), rtol=1e-9)
-        assert f * GOLDEN - f / GOLDEN == pytest.approx(f)
-
-
 # --- lin ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("size", "hop", "ratio"), [(64, 32, 4), (50, 71, 1), (66, 5, 7)])
-@pytest.mark.parametrize(("low", "high", "count"), [(0.0, 1000.0, 15), (30.0, 900.0, 1), (100.0, 120.0, 4)])
+@pytest.mark.parametrize(
+    ("size", "hop", "ratio", "low", "high", "count"),
+    [(64, 32, 4, 0.0, 1000.0, 15), (50, 71, 1, 30.0, 900.0, 1), (66, 5, 7, 100.0, 120.0, 4)],
+)
 def test_lin_is_the_formula(size: int, hop: int, ratio: int, low: float, high: float, count: int) -> None:
     x, rate = sound(700, channels=2), RATE / ratio
     values = {"ams_fbType": "lin", "ams_lowFreqHz": low, "ams_highFreqHz": high, "ams_nFilters": count}
@@ -160,41 +150,12 @@ def test_the_step_follows_from_the_window(
     assert stage.process(sound(1)).shape[-1] == 1
 
 
-MODES: list[dict[str, Any]] = [
-    framed(64, 32),
-    framed(40, 77, 3, ams_wname="triang", ams_nFilters=3),
-    framed(130, 11, 1, ams_cfHz=[30.0, 2.0], ams_wname="hann"),
-    framed(64, 32, ams_fbType="lin", ams_nFilters=4),
-    framed(40, 77, 5, ams_fbType="lin", ams_lowFreqHz=0.0, ams_wname="hann"),
-]
-each_mode = pytest.mark.parametrize("parameters", MODES, ids=str)
-
-
 def test_blocks_longer_than_spans() -> None:
     x = sound(40_000, channels=1)
     whole = AmsFeatures(RATE).process(x)
     stage = AmsFeatures(RATE)
     pieces = np.concatenate([stage.process(block) for block in cut(x, 882)], axis=-1)
     np.testing.assert_allclose(pieces, whole, rtol=0, atol=1e-12)
-
-
-@pytest.mark.filterwarnings("error")
-@each_mode
-def test_silence_and_almost_silence(parameters: dict[str, Any]) -> None:
-    assert not AmsFeatures(SOUND, **parameters).process(np.zeros((2, 3, 1000))).any()
-    one_ear = sound(1000)
-    one_ear[0] = 0
-    made = AmsFeatures(SOUND, **parameters).process(one_ear)
-    assert not made[0].any() and made[1].all()
-    rng = np.random.default_rng(0)
-    for scale in (5e-324, 1e-310, 1e-203, 1e-199, 1e70, 1e300):
-        x = scale * rng.choice([-1.0, 0.0, 1.0], (2, 3, 1000))
-        assert np.isfinite(AmsFeatures(SOUND, **parameters).process(x)).all()
-    stage = AmsFeatures(SOUND, **parameters)
-    stage.process(sound(1000))
-    for _ in range(50):  # filters ring for a long time
-        assert np.isfinite(stage.process(np.zeros((2, 3, 20_000)))).all()
-    assert stage.process(np.zeros((2, 3, 1000))).max() < 1e-9
 
 
 # --- parameters ---------------------------------------------------------------------------------------------------

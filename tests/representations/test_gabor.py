@@ -96,13 +96,6 @@ def by_definition(x: FloatArray, dynamic_range: float, remembered: int) -> Float
     return z
 
 
-@pytest.mark.parametrize(("channels", "count"), [(16, 221), (23, 311), (31, 455), (32, 464), (64, 923)])
-def test_the_number_of_features(channels: int, count: int) -> None:
-    stage = Gabor(given_signal(channels))
-    assert stage.derived == {"gb_nFeatures": count}
-    assert stage.output_rows((2, channels)) == (2, count)
-
-
 @pytest.mark.parametrize("channels", [1, 2, 3, 5, 8, 17])
 def test_weights_follow_the_definition(channels: int) -> None:
     made, expected = patterns(channels), weights_by_definition(channels)
@@ -126,8 +119,9 @@ def test_filters() -> None:
     assert len(made) == 5 + 4 * 9
 
 
-@pytest.mark.parametrize("dynamic_range", [80.0, 20.0, 1000.0])
-@pytest.mark.parametrize(("channels", "rate"), [(5, 3.0), (1, 0.01), (8, 0.5), (3, 100.0)])
+@pytest.mark.parametrize(
+    ("channels", "rate", "dynamic_range"), [(5, 3.0, 80.0), (1, 0.01, 20.0), (8, 0.5, 1000.0), (3, 100.0, 20.0)]
+)
 def test_the_result_follows_the_definition(channels: int, rate: float, dynamic_range: float) -> None:
     """With windows of 15, 1 and 3 frames, and longer than the signal; 2.5 is rounded to 3."""
     x = rates(70, channels)
@@ -173,7 +167,7 @@ def test_a_ripple_is_found_by_its_filter() -> None:
 # --- deviations ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("length", [1, 2, 3, 7, 50, 500])
+@pytest.mark.parametrize("length", [1, 3, 50, 500])
 def test_deviations_are_those_of_the_window(length: int) -> None:
     """With any mean; errors do not accumulate, and windows are independent."""
     rng = np.random.default_rng(length)
@@ -193,8 +187,8 @@ def test_deviations_are_those_of_the_window(length: int) -> None:
     assert not got[900 + length :, 2:4].any()
 
 
-@pytest.mark.parametrize("after", [1, 5, 20, 33, 100])
-@pytest.mark.parametrize("come", [0, 3, 20, 47, 60])
+@pytest.mark.parametrize("after", [1, 20, 33])
+@pytest.mark.parametrize("come", [0, 3, 20, 47])
 def test_another_window_keeps_past_values(come: int, after: int) -> None:
     values = np.random.default_rng(come).standard_normal((200, 4))
     before = RunningZScore(20, np.empty((0, 4)))

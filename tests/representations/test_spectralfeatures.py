@@ -1,4 +1,4 @@
-"""Spectral features: other implementations (statistics of scipy), and known spectra."""
+"""Spectral features: other implementations, known spectra, and the kernel."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.stats
+import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -45,31 +45,21 @@ def spectra(frames: int, seed: int = 0, channels: int = 4) -> FloatArray:
 
 
 def test_against_other_definitions() -> None:
-    """With energies far above E, these are standard statistics."""
+    """Of the features that `rosafe validate` does not compare with others, for energies far above E."""
     x, f = spectra(30), np.array(FREQUENCIES)[:, np.newaxis]
     got = features(x)
     share = x / x.sum(axis=0)
-    center = (f * share).sum(axis=0)
     levels = 10 * np.log10(x)
-    unbiased = np.sqrt(4 / 3)
     expected = {
-        "centroid": center / 3000,
-        "crest": x.max(axis=0) / x.mean(axis=0),
-        "spread": np.sqrt(((f - center) ** 2 * share).sum(axis=0)) / 3000,
-        "entropy": scipy.stats.entropy(x, base=4),
         "brightness": share[1] + share[3],
         "hfc": (f**2 * share).sum(axis=0),
         "decrease": ((x[1] - x[0]) + (x[2] - x[0]) / 2 + (x[3] - x[0]) / 3) / x[1:].sum(axis=0),
-        "flatness": scipy.stats.gmean(x) / x.mean(axis=0),
         "flux": np.sqrt(np.mean(np.diff(levels, axis=1, prepend=levels[:, :1]) ** 2, axis=0)),
-        "kurtosis": scipy.stats.kurtosis(x, fisher=False) / unbiased**4 - 3,
-        "skewness": scipy.stats.skew(x) / unbiased**3,
         "irregularity": np.sqrt(np.mean(np.diff(levels, axis=0) ** 2, axis=0)),
         "variation": [
             scipy.spatial.distance.cosine(x[:, k], x[:, max(0, k - 1)]) if k else 0.0 for k in range(x.shape[1])
         ],
     }
-    assert {*expected, "rolloff"} == set(WORDS)
     for word, values in expected.items():
         np.testing.assert_allclose(got[word], values, rtol=1e-9, atol=2e-11, err_msg=word)
 

@@ -58,6 +58,7 @@ CASES: list[tuple[str, str, dict[str, Any]]] = [
     ("autocorrelation", "autocorrelation", CORRELATION),
     ("autocorrelation", "autocorrelation", {"ac_wSizeSec": 0.003, "ac_hSizeSec": 0.007, "ac_clipMethod": "clc"}),
     ("autocorrelation", "autocorrelation", {**CORRELATION, "ac_K": 0.7, "ac_clipAlpha": 0.1}),
+    ("autocorrelation", "autocorrelation", {**CORRELATION, "ac_K": 10.0, "ac_clipAlpha": 0.0, "ac_clipMethod": "sgn"}),
     ("gabor", "gabor", {}),
     ("precedence", "precedence", {"prec_wSizeSec": 0.03, "prec_hSizeSec": 0.015}),
     ("precedence", "precedence", {"prec_wSizeSec": 0.025, "prec_hSizeSec": 0.04, "prec_maxDelaySec": 0.02}),

@@ -11,7 +11,7 @@ from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.representations.onset_offset_strength import OffsetStrength, OnsetStrength
 
-from .chain import Chain, FloatArray
+from .chain import FloatArray
 
 RATE = 16000.0
 GIVEN = SignalFormat(RATE, 100.0, True, 160, 320, (500.0, 900.0), "gammatone")
@@ -74,23 +74,6 @@ def test_the_level_for_the_maps(kind: type[Stage], limit: str, sign: int) -> Non
     np.testing.assert_allclose(stage.provided["level"][1, 1], [-50, -47, -2000, 12], rtol=0, atol=1e-12)
     stage.process(block[..., :0])
     assert stage.provided["level"].shape == (2, 2, 0)
-
-
-@both
-@pytest.mark.parametrize(("scaling", "per_frame"), [("power", 10.857362), ("magnitude", 5.428681)])
-def test_the_decay_after_sound(kind: type[Stage], limit: str, sign: int, scaling: str, per_frame: float) -> None:
-    """The decay of the integrator per frame, until -2000 dB; then 0."""
-    name = kind.REPRESENTATION.kind
-    ihc = SignalFormat(RATE, RATE, center_frequencies=(500.0, 900.0), filterbank="gammatone")
-    chain = Chain(ihc, [name], {"rm_scaling": scaling, limit: 30.0}, root="ratemap")
-    sound = np.random.default_rng(1).uniform(0, 1, (2, 2, 800))
-    made = chain.run(np.concatenate([sound, np.zeros((2, 2, 80000))], axis=-1), 8000)[name]
-    if sign > 0:
-        assert not made[..., 6:].any()
-        return
-    falls = 2000 / per_frame - 15  # the level of the sound is about -10 to -150 dB
-    np.testing.assert_allclose(made[..., 6 : int(falls)], per_frame, rtol=0, atol=1e-6)
-    assert not made[..., int(2000 / per_frame) + 8 :].any()
 
 
 @both

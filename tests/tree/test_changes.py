@@ -51,7 +51,13 @@ def assert_as(listener: Recorder, tree: Tree, kind: str, outputs: list[dict[str,
 # --- values ---
 
 
-@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize(  # one of each type and processor; tests/processing has all
+    "name",
+    [
+        *("in_normalizeValue", "pp_bRemoveDC", "pp_middleEarModel", "fb_type", "fb_cfHz", "ihc_method"),
+        *("ild_wSizeSec", "rm_decaySec", "cc_maxDelaySec"),
+    ],
+)
 def test_a_change_of_each_parameter(tree: Tree, feed: Feed, listener: Recorder, name: str) -> None:
     """It applies from the next block on, to this processor alone. The bare stages are the reference."""
     value = CHANGES[name]
@@ -74,16 +80,10 @@ def test_values_that_are_rejected(tree: Tree, feed: Feed) -> None:
     grow(tree, feed)
     refusals = {  # texts and ranges: tests/interface
         "pp_bRemoveDC": ("2", ""),
-        "pp_cutoffHzDC": ("nan", "0"),
-        "in_normalizeValue": ("0", "5.0"),
-        "fb_nChannels": ("-1", "1025"),
-        "fb_cfHz": ("100 abc", "8000", "-5", "0 100", "1 " * 2000),
-        "fb_lowFreqHz": ("5000",),
+        "in_normalizeValue": ("5.0",),
+        "fb_cfHz": ("100 abc", "8000"),
         "fb_highFreqHz": ("50", "8001"),
-        "fb_nERBs": ("0", "1e-9"),
         "ild_wSizeSec": ("1e-9", "61"),
-        "rm_hSizeSec": ("1e-9",),
-        "cc_maxDelaySec": ("11",),
     }
     for name, texts in refusals.items():
         processor = tree.find(OWNER[name])

@@ -18,7 +18,7 @@ from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from tests.harness import PATIENCE, wait_for
 
-from .support import RATE, Feed, Plain, Recorder, end, use_plain_stages
+from .support import Feed, Plain, Recorder, end, use_plain_stages
 
 FRAMES = 1
 WORKERS = 4  # enough for all concurrent processors, on any machine
@@ -201,15 +201,3 @@ def test_blocks_are_complete_and_in_order_while_processors_are_added_and_removed
                 assert numbers[-1] == 1999
         else:
             assert processor not in alive or processor.parent not in alive
-
-
-def test_a_stream_of_any_rate_ends_by_itself(listener: Recorder, tree: Tree) -> None:
-    feed = Feed(rate=RATE, frames=100)
-    root = tree.add_input("input", feed, 100, 1.0, 1.0, {"in_doNormalize": False})
-    child = tree.add("preProc", "child", "input")
-    feed.put(count=3)
-    feed.end()
-    assert child.join(PATIENCE)
-    assert root.state is child.state is State.DONE
-    np.testing.assert_array_equal(listener.data(child)[0], np.arange(300))
-    assert listener.blocks[child][-1].next_index == child.next_index == 300

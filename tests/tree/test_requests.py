@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import threading
 import tracemalloc
 from typing import Any
@@ -21,7 +20,7 @@ from rosafe.tree.tree import Tree
 from tests.dsp.bare import single
 from tests.harness import PATIENCE, run_together, wait_for
 
-from .support import RATE, Feed, Plain, Recorder, grow, tree_threads, use_plain_stages
+from .support import RATE, Feed, Plain, Recorder, grow, use_plain_stages
 
 
 def assert_rejected(tree: Tree, ex: str, what: str, request: Any, *arguments: Any) -> None:
@@ -268,17 +267,6 @@ def test_all_processors_together_have_a_share_of_the_memory(
     tree.modify("gammatone", "fb_nChannels", "30")
 
 
-def test_two_hundred_processors(tree: Tree, feed: Feed, listener: Recorder) -> None:
-    tree.add_input("input", feed, 160, 1.0, 1.0, {"in_doNormalize": False})
-    for index in range(200):
-        tree.add("preProc", f"p{index}", "input")
-    feed.put(count=3)
-    for processor in tree.processors:
-        listener.wait_blocks(processor, 3)
-        np.testing.assert_array_equal(listener.data(processor)[1], np.arange(480))
-    assert len(tree_threads()) <= len(os.sched_getaffinity(0)) + 1, "processors are not threads"
-
-
 def test_three_hundred_cycles_leak_no_memory(tree: Tree, feed: Feed, listener: Recorder) -> None:
     tree.add_input("input", feed, 160, 0.1, 0.0)  # the window of the input is full after 10 cycles
 
@@ -347,16 +335,6 @@ def test_a_failing_input_ends_everything(
     wait_for(lambda: not tree.processors)
     assert isinstance(root.error, ArithmeticError)
     assert feed.stopped
-
-
-def test_bad_samples_end_the_input_with_a_reason(tree: Tree, feed: Feed, listener: Recorder) -> None:
-    grow(tree, feed)
-    root = tree.find("input")
-    block = np.ones((2, 160))
-    block[1, 80] = np.nan
-    feed.put(block)
-    wait_for(lambda: not tree.processors)
-    assert "expected finite samples" in str(root.error)
 
 
 @pytest.mark.parametrize("when", ["on_added", "on_released"])
@@ -438,17 +416,3 @@ def test_histories_contain_two_blocks_at_least(tree: Tree, listener: Recorder) -
     feed.put(count=3)
     listener.wait_blocks(tree.find("input"), 3)
     assert tree.find("input").history.read_new("reader").parts[0].frames == 3200
-
-
-def test_frames_of_two_rates_do_not_mix(tree: Tree, feed: Feed, listener: Recorder) -> None:
-    grow(tree, feed)
-    ild = tree.find("ild")
-    feed.put(count=5)
-    listener.wait_blocks(ild, 5)
-    tree.modify("ild", "ild_hSizeSec", "0.005")
-    assert ild.rate == 200.0
-    assert ild.history.read_new("reader").signal.rate == 100.0  # the history is older than the change
-    feed.put(count=5)
-    listener.wait_blocks(ild, 10)
-    (view,), _, signal = ild.history.read_new("reader")
-    assert (view.shape, signal.rate) == ((5, 9), 200.0)  # from sample 640 of 1600 on

@@ -297,13 +297,8 @@ def test_an_input_that_another_client_creates_meanwhile_is_used(client: Client) 
     [
         ({"fb_nChannels": 5000}, "fb_nChannels: expected a number from 0 to 1024, got 5000"),
         ({"fb_lowFreqHz": 9000.0}, "fb_lowFreqHz: expected less than fb_highFreqHz"),
-        ({"fb_nERBs": 0.001}, "fb_nERBs: expected a distance that gives at most"),
-        ({"ihc_method": "hilbrt"}, "ihc_method: expected one of none, halfwave"),
-        ({"ild_wSizeSec": 61.0}, "ild_wSizeSec: expected a number above 0, at most 60, got 61"),
         ({"pi_rangeHz": [400.0, 80.0]}, "pi_rangeHz: expected ascending numbers, got [400.0, 80.0]"),
-        ({"ams_lowFreqHz": 500.0, "ams_highFreqHz": 5.0}, "ams_highFreqHz: expected more than ams_lowFreqHz (500 Hz)"),
         ({"nFramesPerBlock": 0}, "nFramesPerBlock: expected a number from 1 to 10000000, got 0"),
-        ({"bufferSize_s_port": 1e9}, "bufferSize_s_port"),
     ],
 )
 def test_values_impossible_at_any_sample_rate_are_rejected_first(

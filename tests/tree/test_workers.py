@@ -519,7 +519,7 @@ def test_a_slow_listener_is_called_last(
 
 def test_threads_exist_from_the_first_to_the_last_processor(tree: Tree, listener: Blocking) -> None:
     assert tree_threads() == set()
-    for _ in range(20):
+    for _ in range(5):
         feed = Feed(frames=1)
         tree.add_input("input", feed, 1, 1.0, 1.0)
         child = tree.add("preProc", "child", "input")
@@ -536,7 +536,7 @@ def test_a_stop_followed_immediately_by_a_new_tree(listener: Blocking, monkeypat
     """The threads of the old tree may not have ended yet when they are needed again."""
     use_plain_stages(monkeypatch)
     tree = Tree(listener, 2)
-    for _ in range(200):
+    for _ in range(40):  # test_schedules.py runs the possible orders
         feed = Feed(frames=1)
         tree.add_input("input", feed, 1, 1.0, 1.0)
         leaves = [tree.add("preProc", name, "input") for name in "ab"]

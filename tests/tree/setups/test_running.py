@@ -108,7 +108,6 @@ def test_by_http_and_tcl(file: Path, tmp_path: Path) -> None:
     ("arguments", "code", "what"),
     [
         (("load", "/nowhere.yaml"), 1, "/nowhere.yaml: No such file"),
-        (("load", "."), 1, ".: expected a regular file, got a directory"),
         (("load", "FILE", "--full"), 2, "--full is for save"),
         (("save", "FILE", "--keep", "x"), 2, "--keep is for load"),
         (("show", "FILE"), 2, "invalid choice"),
