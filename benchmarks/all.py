@@ -1,4 +1,4 @@
-"""Run all benchmarks and write all tables in benchmarks/results, in about fifteen minutes on an idle machine.
+"""Run all benchmarks and write all tables in benchmarks/results, in about half an hour on an idle machine.
 
 ``/usr/bin/python3 benchmarks/all.py`` stops on a busy machine, like each benchmark. The load is that before the first
 benchmark. The exit code is 1 if a benchmark has failed.

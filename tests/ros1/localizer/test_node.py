@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from rosafe.localization import angles
+from rosafe.localization import angles, cues
 from rosafe.localization.head import Head
 from rosafe.localization.localize import localize
 from rosafe.localization.localizer import Localizer as Offline
@@ -187,9 +187,10 @@ def test_offline_and_live_agree(
                 wait_for(lambda: _has_played(len(sound) - 2 * block, [time.frameIndex for time in times]))
                 wait_for(lambda: _frame(tracked[-1], times[-1]) > len(sound) - 3 * block - rate / 5)
     offline = Offline(rate, str(model))
-    features = Stream(rate, offline.model.parameters, ["itd", "ild", "ic", "ratemap"]).process(
-        np.concatenate((silence, sound)).T
-    )
+    features = Stream(rate, offline.model.parameters, list(cues.KINDS)).process(np.concatenate((silence, sound)).T)
+    # The localizer begins again after the first block of a new stream.
+    new = features["itd_time"] > (len(silence) + block) / rate - offline.hop / 2
+    features = {name: features[name][..., new] for name in (*cues.KINDS, "itd_time")}
     found = offline.update(features, features["itd_time"])
     clock, hop = times[-1], offline.hop * rate
     compared, certain = [], []
