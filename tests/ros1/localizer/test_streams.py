@@ -72,10 +72,10 @@ def test_streams_are_those_of_the_file(
 def test_sources_come_and_go_and_a_slow_and_a_late_subscriber(
     graph: Graph, bass: Process, localizer: Localizer, take: tuple[Path, np.ndarray], tmp_path: Path
 ) -> None:
-    """The talker stops after 3 s, and the music begins after 2.5 s."""
-    parts = take[1].copy()
-    parts[0, :, 3 * RATE :] = 0
-    parts[1, :, : round(2.5 * RATE)] = 0
+    """The talker speaks for 3 s, after a second in which a busy machine begins; there is music 2.5 s later."""
+    parts = np.pad(take[1], ((0, 0), (0, 0), (RATE, 0)))
+    parts[0, :, 4 * RATE :] = 0
+    parts[1, :, : round(3.5 * RATE)] = 0
     path = tmp_path / "come.wav"
     soundfile.write(path, parts.sum(axis=0).T, RATE, subtype="PCM_32")
     audio_class = importlib.import_module("rosAFE.msg").SourceAudio
@@ -94,7 +94,7 @@ def test_sources_come_and_go_and_a_slow_and_a_late_subscriber(
         [m.id for m in messages if abs(math.degrees(m.azimuth) - azimuth) < 10][-1] for azimuth in (TALKER, MUSIC)
     )
     begins = {}
-    for id_, truth, begin, end in ((talker, parts[0], 0.0, 3.0), (tune, parts[1], 2.5, 6.0)):
+    for id_, truth, begin, end in ((talker, parts[0], 1.0, 4.0), (tune, parts[1], 3.5, 7.0)):
         own = [m for m in messages if m.id == id_]
         stream = np.zeros(own[-1].first_sample + len(own[-1].samples))  # with zeros in pauses
         for message in own:
