@@ -77,10 +77,9 @@ def takes_less(work: Callable[[str], object], text: str, limit: float) -> bool:
 
 @pytest.mark.parametrize("name", WORST)
 def test_time_is_linear(name: str) -> None:
-    """A text of eight times the length takes eight times as long, not 64 times."""
-    make = WORST[name]
-    part = seconds(read, make(2**14))
-    assert takes_less(read, make(2**17), 32 * max(part, 0.002))
+    """A text of eight times the length takes eight times as long, not 64 times; the machine is equally busy for both."""
+    part, whole = (WORST[name](2**size) for size in (14, 17))
+    assert any(seconds(read, whole) < 32 * max(seconds(read, part), 0.002) for _ in range(ATTEMPTS))
 
 
 @pytest.mark.parametrize("name", ["tag directives behind", "indents back and forth", "folded quotes", "processors"])

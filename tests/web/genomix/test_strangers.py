@@ -66,7 +66,8 @@ def stranger(answer: bytes, endless: bytes = b"") -> Iterator[Stranger]:
 
 
 def length(reported: object, body: bytes = b"abc") -> bytes:
-    return OK + f"Content-Length: {reported}\r\n\r\n".encode() + body
+    # Otherwise a client may use the connection again before it notices the end.
+    return OK + f"Connection: close\r\nContent-Length: {reported}\r\n\r\n".encode() + body
 
 
 LIES = {
