@@ -260,7 +260,7 @@ def test_a_check_of_a_target_leaves_nothing(tmp_path: Path) -> None:
     assert (tmp_path / "old").read_text() == "old"
 
 
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF])
 def test_outputs_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     """On file systems such as NFS and Lustre."""
 

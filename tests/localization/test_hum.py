@@ -20,7 +20,7 @@ def mains(frequency: float, seconds: float) -> np.ndarray:
     return sum(0.01 / order * np.sin(2 * np.pi * frequency * order * times + order) for order in range(1, 11))
 
 
-@pytest.mark.parametrize("disturbance", ["offset", "60.2"])
+@pytest.mark.parametrize("disturbance", ["offset", "50", "60.2"])
 def test_quiet_sound_is_localized(kemar: rosafe.Head, kemar_model: Path, disturbance: str) -> None:
     added = np.full(round(1.5 * RATE), 0.01) if disturbance == "offset" else mains(float(disturbance), 1.5)
     right = 0

@@ -72,6 +72,24 @@ def test_steady_noise_is_not_a_source_after_two_seconds(kemar_model: Path, noisy
     assert np.sum(talking < 4.0) >= 33 and np.sum(talking > 6.5) >= 20 and not np.any((talking > 5) & (talking < 6))
 
 
+def test_sound_that_is_steady_from_its_start_is_noise_after_a_short_warm_up(
+    kemar_model: Path, noisy_talker: np.ndarray
+) -> None:
+    localizer = rosafe.Localizer(RATE, kemar_model)
+    localizer.noise.warm_up = 2
+    in_blocks(localizer, noisy_talker)
+    assert not len(present(localizer.tracks, NOISE)) and np.sum(present(localizer.tracks, -30) < 4.0) >= 33
+
+
+def test_a_burst_of_noise_is_a_source(kemar_model: Path, kemar: rosafe.Head) -> None:
+    sound = np.zeros((2, 4 * RATE))
+    sound[:, RATE : 2 * RATE] = kemar.render(white(1.0, 2), RATE, 30)
+    sound += 1e-4 * np.random.default_rng(5).standard_normal(sound.shape)
+    found = rosafe.localize(sound, RATE, kemar_model)
+    assert found["azimuth"][199] == pytest.approx(30, abs=5)
+    assert len(present(found["tracks"], 30)) >= 8
+
+
 def test_steady_noise_that_goes_on_is_a_source_for_two_seconds(kemar_model: Path, kemar: rosafe.Head) -> None:
     sound = kemar.render(np.concatenate((np.zeros(RATE), white(5.0, 2))), RATE, 30)
     times = present(rosafe.localize(sound, RATE, kemar_model)["tracks"], 30)

@@ -94,7 +94,7 @@ def _clockwise(lab: Laboratory) -> None:
     lab.source[:, 0] = -lab.source[:, 0] % 360
 
 
-@pytest.mark.parametrize("rate", [8000.0, 96000.0])
+@pytest.mark.parametrize("rate", [8000.0, 16000.0, 44100.0, 96000.0])
 @pytest.mark.parametrize(
     ("change", "correction"), [(_right_ear_first, "the ears are exchanged"), (_clockwise, "the azimuths are negated")]
 )
