@@ -19,12 +19,12 @@ import numpy as np
 from rosafe.dsp import kernels
 from rosafe.dsp.kernels import build
 
-LANES = {2: 2, 3: 4, 4: 8, 8: 2}  # numbers per register, by the level of the instruction set
 ROWS = 62  # 31 channels of two ears
-FRAME_SECONDS, HOP_SECONDS, DELAY_SECONDS = 0.02, 0.01, 0.0011
+FRAME_SECONDS, HOP_SECONDS, DELAY_SECONDS = 0.02, 0.01, 0.0011  # defaults of the frames and of cc_maxDelaySec
 SECONDS = 0.2  # of each measurement
 SOURCE = """
 #include "vector.h"
+int64_t numbers_per_register(void) { return LANES; }
 double fused_products(int64_t times) {
     vec sums[12] = {};
     UNROLL for (int k = 0; k < 12; k++) sums[k] = all(k);
@@ -66,7 +66,8 @@ def limits(rate: float, rounds: int) -> dict[str, float]:
         compiler = next(name for name in build.COMPILERS if shutil.which(name))
         options = (f"-march={levels[level]}", f"-I{build.HERE}", "-Wno-unused")
         subprocess.run([compiler, *build.FLAGS, *options, source, "-o", library], check=True)
-        run = ctypes.CDLL(str(library)).fused_products
+        peak = ctypes.CDLL(str(library))
+        run = peak.fused_products
         run.argtypes, run.restype = [ctypes.c_int64], ctypes.c_double
         rates = []
         for _ in range(rounds):
@@ -75,5 +76,5 @@ def limits(rate: float, rounds: int) -> dict[str, float]:
                 run(100000)
                 done += 12 * 100000
             rates.append(done / (time.thread_time() - begin))
-    per_ms = np.median(rates) / 1000 * LANES[level]
+        per_ms = np.median(rates) / 1000 * peak.numbers_per_register()
     return {stage: count / per_ms for stage, count in instructions(rate).items()}

@@ -124,7 +124,7 @@ def measure() -> dict[str, float]:
     return {
         "messages per second": len(messages) / SECONDS,
         "processor time of the localizer, % of a core": 100 * used["localizer"],
-        "the same without speech, which only ~poses does not need": 100 * without_speech,
+        "the same without speech: only ~poses is subscribed, % of a core": 100 * without_speech,
         "additional processor time of rosAFE, % of a core": 100 * (used["rosAFE"] - idle),
         "publication - header.stamp, median, ms": 1000 * float(np.median(latency)),
         "publication - header.stamp, 99 %, ms": 1000 * float(np.percentile(latency, 99)),
