@@ -621,7 +621,7 @@ class LocalizationLoop:
         self._queue.append(new)
 
     def _check_frames(self) -> bool:
-        """Return whether sources are known: frames were used lately. The next ones tell whether sound was lost."""
+        """Return whether frames were used lately; otherwise the sources are unknown until the next frames arrive."""
         now = time.monotonic()
         source = self._source
         if source is None:

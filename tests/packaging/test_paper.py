@@ -73,9 +73,9 @@ def test_figures_are_those_of_the_measurements() -> None:
 @pytest.mark.parametrize(
     ("text", "section", "column"),
     [
-        ("within 5 degrees in {} of 360 trials", "Speech, matched head", 1),
-        ("the share is {} at 0 dB", "Speech, matched head", 4),
-        ("direct-to-reverberant ratio of 0 dB {}.", "Rooms: one talker, matched head", 1),
+        ("within 5 degrees in a share of {} of 360 trials", "Speech, matched head", 1),
+        ("At 0 dB the share is {};", "Speech, matched head", 4),
+        ("direct-to-reverberant ratio of 0 dB it is {}.", "Rooms: one talker, matched head", 1),
     ],
 )
 def test_localization_figures(text: str, section: str, column: int) -> None:

@@ -238,7 +238,7 @@ def test_services_wait_for_a_master_and_notify_the_watchdog(
     master.kill()
 
     def wait_until_sent(text: str, times: int) -> None:
-        """Wait until each service has sent a text so many times."""
+        """Wait until each service has sent a text the given number of times."""
         wait_for(
             lambda: all(messages.count(text) >= times for _, messages in services),
             what=lambda: f"{times} times {text} of {services}",
