@@ -77,7 +77,7 @@ def takes_less(work: Callable[[str], object], text: str, limit: float) -> bool:
 
 @pytest.mark.parametrize("name", WORST)
 def test_time_is_linear(name: str) -> None:
-    """A text of eight times the length takes eight times as long, not 64 times; the machine is equally busy for both."""
+    """Eight times the text takes eight times as long, not 64 times. The machine is equally busy for both."""
     part, whole = (WORST[name](2**size) for size in (14, 17))
     assert any(seconds(read, whole) < 32 * max(seconds(read, part), 0.002) for _ in range(ATTEMPTS))
 
