@@ -14,7 +14,8 @@ from genomix.event import GenoMError, error_of
 if TYPE_CHECKING:
     from genomix.client import Client
 
-WAIT_SECONDS = 60.0  # of one request to genomixd
+# Of one request to genomixd. Ctrl-C that arrives just before Python begins to read the answer has no effect until then.
+WAIT_SECONDS = 5.0
 
 
 class Status(enum.Enum):

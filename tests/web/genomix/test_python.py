@@ -251,6 +251,23 @@ def test_an_interrupt_aborts_the_activity(world: World) -> None:
     harness.wait_for(lambda: not live_activities(world, "bass"), what="end of the capture")
 
 
+UNNOTICED = f"""
+import signal, threading
+# The signal reaches another thread, so the main thread goes on with reading the answer.
+threading.Thread(target=threading.Event().wait, daemon=True).start()
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+{BLOCKING}
+"""
+
+
+def test_an_interrupt_that_is_not_noticed_at_once(world: World) -> None:
+    with world.graph.start(harness.PYTHON, "-c", UNNOTICED, GENOMIXD=f"127.0.0.1:{world.port}") as process:
+        harness.wait_for(lambda: live_activities(world, "bass"), what="start of the capture")
+        process.stop(signal.SIGINT, harness.PATIENCE / 2)
+        assert "KeyboardInterrupt" in process.err
+    harness.wait_for(lambda: not live_activities(world, "bass"), what="end of the capture")
+
+
 def test_an_interrupt_before_the_start_aborts_the_activity(g: genomix.Client, monkeypatch: pytest.MonkeyPatch) -> None:
     bass = g.load("bass")
     ids: list[str] = []
