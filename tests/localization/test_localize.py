@@ -129,6 +129,13 @@ def test_the_level_is_that_of_the_sound(sphere_model: Path) -> None:
     assert found["level_db"][-1] == pytest.approx(20 * np.log10(0.05), abs=4)
 
 
+def test_the_level_counts_the_power_of_both_ears() -> None:
+    features = {"itd": np.zeros((1, 2)), "ild": np.zeros((1, 2)), "ic": np.ones((1, 2))}
+    features["ratemap"] = np.array([[[0.25, 1e-9]], [[0.75, 1.0]]])  # (ear, channel, frame)
+    found = cues.quantize(features, 0.0, cues.MAX_ITD)
+    np.testing.assert_allclose(found.level, [[0.0], [10 * np.log10(1 + 1e-9)]], atol=1e-12)
+
+
 def test_integers_are_the_same_sound(sphere_model: Path) -> None:
     whole = np.round(rosafe.Head.sphere().render(modulated(0.3, 2), RATE, 30) * 2**15).astype(np.int16)
     floats, integers = (rosafe.localize(sound, RATE, sphere_model) for sound in (whole / 2.0**15, whole.T))
