@@ -253,7 +253,7 @@ def test_an_interrupt_aborts_the_activity(world: World) -> None:
 
 UNNOTICED = f"""
 import signal, threading
-# The signal reaches another thread, so the main thread goes on with reading the answer.
+# The signal reaches another thread, so the main thread is not interrupted while it reads the answer.
 threading.Thread(target=threading.Event().wait, daemon=True).start()
 signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
 {BLOCKING}
