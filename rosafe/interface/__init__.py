@@ -8,8 +8,6 @@ the IDL files of this folder.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from rosafe.declarations.errors import ComponentError
 from rosafe.declarations.idl import ros_type
 from rosafe.declarations.parameter import MAX_SEQUENCE, MAX_STRING, REQUIRED, Parameter, format_value
@@ -34,10 +32,3 @@ from .rosafe import (
 from .service import ComponentSpec, PortSpec, Service
 
 COMPONENTS = {c.name: c for c in (ROSAFE, BASS)}
-
-
-def all_services() -> Iterator[tuple[ComponentSpec, Service]]:
-    """Yield every (component, service) pair on the ROS graph."""
-    for component in COMPONENTS.values():
-        for service in component.on_graph:
-            yield component, service

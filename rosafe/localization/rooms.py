@@ -66,37 +66,3 @@ def surround(head: Any, sample_rate: float, directions: int = DIRECTIONS) -> Flo
     """Return the responses (directions, 2, N) of a head for directions that surround it evenly."""
     filters = head.filters(sample_rate)
     return np.stack([filters.response(float(angles.wrap(one))) for one in np.arange(directions) * 360 / directions])
-
-
-def reverberant_filters(
-    head: Any,
-    azimuth_deg: float,
-    sample_rate: float,
-    rt60: float,
-    drr_db: float,
-    generator: np.random.Generator,
-) -> FloatArray:
-    """Return the impulse responses (2, samples) of both ears for a source in a room.
-
-    Parameters
-    ----------
-    head : Head
-        The head.
-    azimuth_deg : float
-        Direction of the source from the head, degrees.
-    sample_rate : float
-        Hz.
-    rt60 : float
-        Reverberation time, s.
-    drr_db : float
-        Energy of the direct sound over all the rest, both ears together, in dB.
-    generator : numpy.random.Generator
-        Source of the reflections; the same state gives the same room.
-    """
-    direct = head.filters(sample_rate).response(float(angles.wrap(azimuth_deg)))
-    late = reverberation(surround(head, sample_rate), sample_rate, rt60, drr_db, generator)
-    late = late * np.sqrt(np.sum(direct**2)) * 10 ** (-drr_db / 20)
-    response = np.zeros((2, max(direct.shape[1], late.shape[1])))
-    response[:, : late.shape[1]] = late
-    response[:, : direct.shape[1]] += direct
-    return response

@@ -9,15 +9,28 @@ import scipy.signal
 from rosafe.localization.head import Head
 from rosafe.localization.localize import localize
 from rosafe.localization.localizer import Localizer
-from rosafe.localization.rooms import reverberant_filters
+from rosafe.localization.rooms import reverberation, surround
 from tests.localization.conftest import modulated
 
 RATE = 16000
 HEAD = Head.sphere()
 
 
+def reverberant_filters(
+    head: Head, azimuth: float, rt60: float, drr_db: float, generator: np.random.Generator
+) -> np.ndarray:
+    """Return the impulse responses (2, samples) of both ears for a source in a room."""
+    direct = head.filters(RATE).response(azimuth)
+    late = reverberation(surround(head, RATE), RATE, rt60, drr_db, generator)
+    late = late * np.sqrt(np.sum(direct**2)) * 10 ** (-drr_db / 20)
+    response = np.zeros((2, max(direct.shape[1], late.shape[1])))
+    response[:, : late.shape[1]] = late
+    response[:, : direct.shape[1]] += direct
+    return response
+
+
 def late(azimuth: float, rt60: float, drr_db: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    response = reverberant_filters(HEAD, azimuth, RATE, rt60, drr_db, np.random.default_rng(seed))
+    response = reverberant_filters(HEAD, azimuth, rt60, drr_db, np.random.default_rng(seed))
     direct = HEAD.filters(RATE).response(azimuth)
     rest = response.copy()
     rest[:, : direct.shape[1]] -= direct
@@ -51,9 +64,7 @@ def test_late_part_is_diffuse() -> None:
 
 
 def test_equal_generators_give_equal_rooms_and_others_do_not() -> None:
-    first, again, other = (
-        reverberant_filters(HEAD, 10, RATE, 0.3, 2, np.random.default_rng(seed)) for seed in (5, 5, 6)
-    )
+    first, again, other = (reverberant_filters(HEAD, 10.0, 0.3, 2, np.random.default_rng(seed)) for seed in (5, 5, 6))
     assert np.array_equal(first, again)
     assert not np.allclose(first, other, atol=1e-3)
 
@@ -63,7 +74,7 @@ def test_directions_in_rooms(kemar: Head, kemar_model: Path) -> None:
     right = []
     for number, azimuth in enumerate(range(-165, 180, 30)):
         room = np.random.default_rng(100 + number)
-        response = reverberant_filters(kemar, azimuth, RATE, room.uniform(0.2, 0.8), 0.0, room)
+        response = reverberant_filters(kemar, azimuth, room.uniform(0.2, 0.8), 0.0, room)
         sound = scipy.signal.oaconvolve(modulated(1.5, number)[np.newaxis], response, axes=-1)[:, : 3 * RATE // 2]
         found = localize(sound, RATE, kemar_model, 1.0)
         right.append(abs(found["azimuth"][-1] - azimuth) <= 5)
@@ -76,7 +87,7 @@ def test_a_room_is_noticed_and_its_absence(kemar: Head, kemar_model: Path, drr_d
     dry = modulated(4.0, 3)
     direct = kemar.render(dry, RATE, 40.0)
     noise = np.random.default_rng(4).standard_normal(direct.shape) * np.std(direct) * 10 ** (-15 / 20)
-    response = reverberant_filters(kemar, 40.0, RATE, 0.4, drr_db, np.random.default_rng(2))
+    response = reverberant_filters(kemar, 40.0, 0.4, drr_db, np.random.default_rng(2))
     room = scipy.signal.oaconvolve(dry[np.newaxis], response, axes=1)[:, : len(dry)]
     localizer = Localizer(RATE, kemar_model)
     decisions = []
