@@ -18,7 +18,7 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
-from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE, all_services  # noqa: E402
+from rosafe.interface import COMPONENTS, CORE_REPRESENTATIONS, KINDS, ROSAFE  # noqa: E402
 from rosafe.ros1.component import generate  # noqa: E402
 from rosafe.ros1.transport.master import PrivateMaster  # noqa: E402
 from rosafe.ros1.transport.paths import program  # noqa: E402
@@ -68,7 +68,7 @@ class Session:
         import rospy
 
         master = rosgraph.Master("/benchmark")
-        expected = {f"/{component.name}/{service.name}" for component, service in all_services()}
+        expected = {f"/{part.name}/{service.name}" for part in COMPONENTS.values() for service in part.on_graph}
         self.wait(lambda: expected <= {name for name, _ in master.getSystemState()[2]}, "the nodes do not start")
         rospy.init_node("benchmark", argv=["benchmark"], disable_signals=True, log_level=rospy.FATAL)
 

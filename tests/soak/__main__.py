@@ -46,11 +46,11 @@ def main() -> int:
 def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="soak",
-        description="Run a master, bass-ros, rosAFE-ros and genomixd for a long time with the faults that occur in the "
-        "field (processes killed or stopped, garbage, many processors, concurrent clients, changes) and attacks "
-        "(floods, silence, wrong lengths). After each round, check that every sample on every "
-        "port is correct, that no frame was lost without a reason, that other clients are answered, and that the "
-        "processes do not grow.",
+        description="Run a master, bass-ros, rosAFE-ros, genomixd, localizer, live page and the ROS 2 node for a long "
+        "time with the faults that occur in the field (processes killed or stopped, garbage, many processors, "
+        "concurrent clients, changes, subscribers that come and go) and attacks (floods, silence, wrong lengths). "
+        "After each round, check that every sample on every port is correct, that no frame was lost without a reason, "
+        "that other clients are answered, and that the processes do not grow.",
         epilog="examples:\n  scripts/soak --minutes 60\n  scripts/soak --minutes 10 --only a_mixed_load\n\n"
         f"faults and attacks: {', '.join(FAULTS)}",
         formatter_class=argparse.RawDescriptionHelpFormatter,

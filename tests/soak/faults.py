@@ -148,6 +148,13 @@ def genomix_requests(world: World, chance: random.Random) -> None:
     assert world.http.call("bass/Audio")["Audio"]["sampleRate"] == world.size.rate
 
 
+def subscribers_come_and_go(world: World, chance: random.Random) -> None:
+    """Subscribers of the localizer, pages and subscribers in ROS 2, some of which are killed."""
+    for _ in range(3):
+        world.robot.visit(chance)
+    world.robot.check()
+
+
 DURING = (
     subscriber_dies,
     garbage,
@@ -158,6 +165,7 @@ DURING = (
     master_dies,
     bass_is_stopped_briefly,
     genomix_requests,
+    subscribers_come_and_go,
 )
 
 

@@ -26,6 +26,7 @@ from rosafe.tree.history import SlidingWindow, frames_in
 from tests import harness
 from tests.harness import free_port, freeze, proc, run_together, wait_for
 from tests.ros1.afe.session import Session, assert_holds
+from tests.soak.robot import Robot
 from tests.web.genomix.world import Http, genomixd
 
 NAMES = {kind: ROSAFE.service(entry.request).parameter("name").default for kind, entry in CORE_REPRESENTATIONS.items()}
@@ -84,7 +85,10 @@ class ResourceUse:
 
 
 class World:
-    """A master, bass, rosAFE and genomixd. bass plays noise in a loop, so that a frame's number determines it."""
+    """A master, bass, rosAFE and genomixd, and the rest of a robot.
+
+    bass plays noise in a loop, so that a frame's number determines it.
+    """
 
     def __init__(self, size: Size, graph: harness.Graph, master: harness.MasterProcess, stack: ExitStack) -> None:
         self.size = size
@@ -107,6 +111,20 @@ class World:
         self.http_address = "127.0.0.1", port
         self.acquire()
         self.afe.ok("connect_port", local="Audio", remote="bass/Audio")
+        self._stack = stack
+        self._robot: Robot | None = None
+
+    @property
+    def robot(self) -> Robot:
+        """The localizer, the live page and the ROS 2 node, which are started when they are used first."""
+        if self._robot is None:
+            self._robot = Robot(self.graph, self._stack)
+        return self._robot
+
+    def processes(self) -> dict[str, harness.Process]:
+        """Return all processes that run."""
+        own = {"rosAFE": self.afe.process, "bass": self.bass, "genomixd": self.genomixd}
+        return own | (self._robot.processes if self._robot is not None else {})
 
     @staticmethod
     def _noise(frames: int) -> np.ndarray:
@@ -203,15 +221,14 @@ class World:
 
     def check_alive(self) -> None:
         """Check that all processes are running, and that none has logged a traceback."""
-        for process in (self.afe.process, self.bass, self.genomixd):
+        for process in self.processes().values():
             assert process.alive, f"it has ended: {process}"
             assert "Traceback" not in process.err, process
         assert self.http.call("rosAFE/getParameters")["parameters"]["input"][0]["name"] == "input"
 
     def use(self) -> dict[str, ResourceUse]:
         """Return the resources of the processes."""
-        processes = {"rosAFE": self.afe.process, "bass": self.bass, "genomixd": self.genomixd}
-        return {name: ResourceUse.of(process.pid) for name, process in processes.items()}
+        return {name: ResourceUse.of(process.pid) for name, process in self.processes().items()}
 
     def use_without_tree(self) -> dict[str, ResourceUse]:
         """Remove all processors, and return the resources of the processes after unused memory was returned.
