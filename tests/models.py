@@ -29,7 +29,11 @@ def learn(
     factory: pytest.TempPathFactory, sample_rate: float, seconds: float | None = None, head: Head | None = None
 ) -> DirectionModel:
     """Return the model of a head (the sphere) for a sample rate; the first process of a run that needs it learns it."""
-    folder, head = cache(factory), head or Head.sphere()
+    return learn_in(cache(factory), sample_rate, seconds, head or Head.sphere())
+
+
+def learn_in(folder: Path, sample_rate: float, seconds: float | None, head: Head) -> DirectionModel:
+    """Return the model of a head; the first process that needs it stores it in a folder."""
     with (
         open(folder / f"{head.key}-{sample_rate:g}.lock", "w") as lock,
         pytest.MonkeyPatch.context() as patch,

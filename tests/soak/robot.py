@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import soundfile
 
+from rosafe.localization.head import Head
+from tests import models
 from tests.harness import PYTHON, Graph, Process, freeze, wait_for
 from tests.localization.conftest import RATE, modulated
 from tests.ros1.afe.session import diagnosed
@@ -33,7 +35,6 @@ sample_rate: {rate}
 sources:
   - {{name: talker, file: {file}, loop: true, level_db: -25, azimuth: {azimuth}}}
 """
-LEARNING_SECONDS = 300.0  # of the model of the head, on a busy machine
 MESSAGES = 20  # for one subscriber: two seconds
 
 
@@ -48,12 +49,12 @@ class Robot:
         ears, afe = (
             stack.enter_context(graph.node(f"{name}-ros", "-i", f"robot_{name}")) for name in ("bass", "rosAFE")
         )
-        answer = graph.call("/robot_bass/Acquire", device=device, nFramesPerChunk=RATE // 20, nChunksOnPort=20)
+        answer = graph.call("/robot_bass/Acquire", device=device, nFramesPerChunk=RATE // 20, nChunksOnPort=60)
         assert answer.genom_success, answer.genom_exdetail
-        options = ("--rosafe", "robot_rosAFE", "--connect", "robot_bass/Audio")
+        model = graph.home / "sphere.head"
+        models.learn_in(graph.home, RATE, None, Head.sphere()).save(model)
+        options = ("--rosafe", "robot_rosAFE", "--connect", "robot_bass/Audio", "--head", str(model))
         self._localizer = stack.enter_context(running_localizer(graph, *options, name="robot_localizer"))
-        log = self._localizer.process
-        wait_for(lambda: "localizing with" in log.err, LEARNING_SECONDS, what=lambda: f"the model of the head: {log}")
         self._live = stack.enter_context(live(graph, "-i", "robot_rosAFE", "--bass", "robot_bass"))
         self.processes = {
             "robot's bass": ears,
@@ -67,7 +68,9 @@ class Robot:
             print(f"soak: without ROS 2: {environment}", flush=True)
         else:
             self._ros2 = stack.enter_context(network(environment, graph.home))
-            node = self.processes["ROS 2 node"] = self._ros2.node(f"device:={device}", "localize:=true")
+            node = self.processes["ROS 2 node"] = self._ros2.node(
+                f"device:={device}", "localize:=true", f"head:={model}"
+            )
             wait_for(lambda: "acquiring" in node.err or not node.alive, what=lambda: f"the sound of {node}")
         self._lost = self.lost()  # while the nodes connect
 
