@@ -49,9 +49,8 @@ def test_a_round_of_the_soak(graph_without_master: harness.Graph, only: tuple[st
 def test_the_soak_finds_a_fault(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     """A process that has ended unexpectedly."""
     with Process(["sleep", "60"], dict(os.environ)) as lasting, Process(["sleep", "60"], dict(os.environ)) as dying:
-        there = SimpleNamespace(
-            afe=SimpleNamespace(process=lasting), bass=lasting, genomixd=dying, stream=nullcontext, size=LIGHT
-        )
+        processes = {"rosAFE": lasting, "genomixd": dying}
+        there = SimpleNamespace(processes=lambda: processes, stream=nullcontext, size=LIGHT)
         there.check_alive = lambda: World.check_alive(cast(World, there))
 
         def end(world: Any, chance: Any) -> None:
