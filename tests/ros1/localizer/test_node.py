@@ -156,14 +156,14 @@ def test_offline_and_live_agree(
     """The posterior of each frame is that of rosafe.Localizer for the same sound.
 
     If the block is a multiple of the hop, as that of an input that the localizer creates, all frames begin at the same
-    samples. Otherwise only the sources are the same. How many messages arrive is not checked: a localizer that is late
+    samples. Otherwise only the sources are the same. The sound is long, because a localizer that is late
     publishes once for all frames that wait.
     """
     import rosAFE.msg
 
     model = tmp_path / "sphere.head"
     models.learn(tmp_path_factory, rate, None if rate == RATE else 40.0).save(model)
-    silence, sound = np.zeros((20 * block, 2), np.int32), two_talkers(6.0, rate)
+    silence, sound = np.zeros((20 * block, 2), np.int32), two_talkers(12.0, rate)
     for name, samples in (("silence", silence), ("sound", sound)):
         soundfile.write(tmp_path / f"{name}.wav", samples, rate, subtype="PCM_32")
     options = ("--head", str(model), "--rosafe", "exact")
@@ -202,16 +202,16 @@ def test_offline_and_live_agree(
             compared.append(np.abs(found["posterior"][nearest] - np.array(message.probability)).max())
             certain.append(found["posterior"][nearest].max())
     if block % round(hop) == 0:
-        assert compared and min(certain) < 0.9
+        assert len(compared) >= 20 and min(certain) < 0.9
         assert np.max(compared) < 1e-6, (np.median(compared), np.max(compared))
     near = []
     for message in tracked:
-        if not -3 * rate < _frame(message, clock) - len(sound) < 0:
+        if not -9 * rate < _frame(message, clock) - len(sound) < 0:
             continue
         at = (_frame(message, clock) + len(silence)) / rate
         sources = [t["azimuth"][int(np.abs(t["time"] - at).argmin())] for t in offline.tracks if t["first_time"] < at]
         near += [min(abs(azimuth - other) for other in sources) < 5 for azimuth in present(message)]
-    assert near and np.mean(near) > 0.9, near
+    assert len(near) > 10 and np.mean(near) > 0.9, near
 
 
 def two_talkers(seconds: float, rate: int) -> np.ndarray:
@@ -253,12 +253,13 @@ def test_two_talkers_and_a_turning_head(
     ):
         acquire(graph, device)
         first = localizer.sources(lambda message: bool(present(message))).header.stamp.to_sec()
+        begin = first + 3  # certain after a turn of the head
+        wait_for(lambda: sum(message.header.stamp.to_sec() > begin for message in messages) > 25)
         wait_for(lambda: messages[-1].header.stamp.to_sec() > first + 10)
         state = localizer.state(lambda entries: True)
     assert {message.header.frame_id for message in messages} == {"world"}
-    begin = first + 3  # certain after a turn of the head
     received = [message for message in messages if begin < message.header.stamp.to_sec()]
-    assert received
+    assert len(received) > 25
     time = np.array([truth.stamp.to_sec() for truth in truths])
     at, errors = [], []
     both = 0
