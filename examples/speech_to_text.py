@@ -6,15 +6,18 @@ replace it by any recognizer. This one uses vosk or pocketsphinx (pip install), 
 
 import json
 import math
-from collections import defaultdict, deque
+from collections import deque
 
 import numpy as np
 import rospy
 from rosAFE.msg import SoundSources, SourceAudio
 
 FRONT = math.radians(30)
-recent = defaultdict(lambda: deque(maxlen=50))  # by id, the parts of the last second: speech is noticed after its start
-utterances = {}  # by id, the parts of those that speak
+BEFORE = 1.0  # s: speech is noticed after its start
+LATE = 3.0  # s, at most: sound arrives after the direction of its time
+parts = deque(maxlen=10000)  # id, time and samples of each part of a stream, for about a minute
+begins = {}  # by id, when those that speak have begun
+ended = deque()  # id, begin and end of utterances
 
 
 def recognize(samples):
@@ -39,16 +42,21 @@ def recognize(samples):
 
 
 def add_part(part):
-    utterances.get(part.id, recent[part.id]).append(part)
+    parts.append((part.id, part.header.stamp.to_sec(), np.array(part.samples, np.int16)))
 
 
 def find_speakers(message):
+    now = message.header.stamp.to_sec()
     front = {one.id for one in message.sources if one.speech > 0.5 and abs(one.azimuth) < FRONT}
-    for id_ in front - utterances.keys():
-        utterances[id_] = list(recent.pop(id_, ()))
-    for id_ in utterances.keys() - front:
-        samples = [sample for part in utterances.pop(id_) for sample in part.samples]
-        print(id_, recognize(np.array(samples, np.int16)), flush=True)
+    for id_ in front - begins.keys():
+        begins[id_] = now - BEFORE
+    for id_ in begins.keys() - front:
+        ended.append((id_, begins.pop(id_), now))
+    newest = parts[-1][1] if parts else 0.0
+    while ended and (newest >= ended[0][2] or now > ended[0][2] + LATE):
+        id_, begin, end = ended.popleft()
+        heard = [samples for one, time, samples in list(parts) if one == id_ and begin <= time < end]
+        print(id_, recognize(np.concatenate(heard or [np.zeros(0, np.int16)])), flush=True)
 
 
 rospy.init_node("speech_to_text")

@@ -8,6 +8,7 @@ import signal
 import subprocess
 from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import hypothesis
@@ -211,6 +212,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items.sort(key=lambda item: order.get(item.path, int(item.path not in slow)))
 
 
+@cache  # thousands of tests are in few files
 def _is_in(path: Path, folders: tuple[str, ...]) -> bool:
     """Return whether a file or folder of tests is one of `folders` or in one of them."""
     return any(path.is_relative_to(harness.ROOT / "tests" / folder) for folder in folders)

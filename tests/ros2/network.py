@@ -35,7 +35,11 @@ def variables() -> dict[str, str] | str:
         f"{check.stdout}\nenv -0",
     ]
     found = subprocess.run(shell, capture_output=True, text=True, check=True).stdout
-    return dict(entry.split("=", 1) for entry in found.strip("\0").split("\0"))
+    env = dict(entry.split("=", 1) for entry in found.strip("\0").split("\0"))
+    if options := os.environ.get("COVERAGE_PROCESS_START"):  # of scripts/test --coverage
+        env |= {name: value for name, value in os.environ.items() if name.startswith("COVERAGE_")}
+        env["PYTHONPATH"] = f"{Path(options).parent}:{env['PYTHONPATH']}"
+    return env
 
 
 class Network:
