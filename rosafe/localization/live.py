@@ -596,9 +596,8 @@ class LocalizationLoop:
             self._begin_again()
             return False
         middles = np.maximum.accumulate(middles)
-        yaw = np.stack((middles, used.yaw), axis=1) if used.yaw.any() else 0.0
         try:
-            result = localizer.update(used.frames.features, middles, yaw, last_only=True)
+            result = self._localize(localizer, used, middles)
         except ValueError as problem:  # not finite
             self._status.set("values", WARN, f"messages of rosAFE cannot be used: {problem}")
             self._begin_again()
@@ -609,8 +608,16 @@ class LocalizationLoop:
         self._status.value("directions of steady noise (degrees)", steady or "none")
         self._estimate = result["azimuths"], result["posterior"][0]
         self._newest, self._queue.used_at = float(result["time"][0]), time.monotonic()
-        self._callbacks.updated(localizer.updated_at, localizer.sources, float(used.yaw[-1]))
         return True
+
+    def _localize(self, localizer: Localizer, used: TurnedFrames, middles: FloatArray) -> dict[str, Any]:
+        """Return the estimate for the last frame. Each update of the tracks is reported, also those of a long block."""
+        yaw = np.stack((middles, used.yaw), axis=1) if used.yaw.any() else 0.0
+        for part in localizer.update_parts(len(middles)):
+            features = {kind: array[..., part] for kind, array in used.frames.features.items()}
+            result = localizer.update(features, middles[part], yaw, last_only=True)
+            self._callbacks.updated(localizer.updated_at, localizer.sources, float(used.yaw[part][-1]))
+        return result
 
     def _append(self, new: NewFrames, localizer: Localizer) -> None:
         if new.lost:

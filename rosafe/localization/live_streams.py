@@ -19,6 +19,7 @@ from rosafe.localization.streams import LAG, RATE, UNIT, SourcePart, SourceStrea
 from rosafe.localization.tracker import Track
 
 BLOCK_SECONDS = UNIT / RATE  # of sound that is read together
+MAX_UPDATES = 100  # of tracks, that wait for the sound: ten seconds
 _WAIT = 0.1  # s between two checks whether there are subscribers
 _PATIENCE = 0.5  # s of waiting for the tracks of a block: those of a busy machine are late
 _STEP = 0.05  # s after the last update of the tracks, when there are none any more
@@ -196,7 +197,7 @@ class _Updates:
                 self._waiting, self._set_back = [], True
             self._moment, self._follows = moment, moment >= self._needed
             copies = [_Present.of(track, self._first_id) for track in tracks if track.id]
-            self._waiting = [*self._waiting[-20:], (moment, copies, yaw)]
+            self._waiting = [*self._waiting[-MAX_UPDATES:], (moment, copies, yaw)]
             self._changed.notify_all()
 
     def begin_again(self, first_id: int) -> None:

@@ -203,16 +203,16 @@ class Localizer(OwnState):
             .sum(axis=1)
         )
         ends = times + self._window_seconds / 2
-        steps = self._steps(len(times), last_only)
+        parts = self.update_parts(len(times)) if last_only else [slice(k, k + 1) for k in range(len(times))]
         count = min(1, len(times)) if last_only else len(times)
         azimuth, confidence, level = np.empty((3, count))
         posterior = np.empty((count, len(self.azimuths)))
-        for begin, end in steps:
-            window = self._evidence
-            window.extend(quantized.select(slice(begin, end)), power[begin:end], yaw[begin:end])
-            self._count += end - begin
+        for part in parts:
+            window, end = self._evidence, part.stop
+            window.extend(quantized.select(part), power[part], yaw[part])
+            self._count += end - part.start
             if not last_only or end == len(times):
-                row = -1 if last_only else begin
+                row = -1 if last_only else part.start
                 azimuth[row], confidence[row], posterior[row] = self._estimate(yaw[end - 1])
                 level[row] = window.power()
             if self._count % self._update_frames == 0:
@@ -228,6 +228,12 @@ class Localizer(OwnState):
             "level_db": level,
         }
 
+    def update_parts(self, frames: int) -> list[slice]:
+        """Return the parts of the next frames, of which each but the last ends with an update of `sources`."""
+        first = self._update_frames - self._count % self._update_frames
+        ends = [*range(first, frames, self._update_frames), frames] if frames else []
+        return [slice(begin, end) for begin, end in itertools.pairwise([0, *ends])]
+
     def _update_tracks(self, time: float, yaw: float) -> None:
         window = self._evidence
         self.noise.update(window.lowest_level(self._update_frames))
@@ -235,12 +241,6 @@ class Localizer(OwnState):
         found = candidates(units, yaw, DRY_SHARPNESS if window.surroundings.dry else 1.0)
         found = self.noise.remove_from(found, time, yaw)
         self._tracker.update(found, time, yaw)
-
-    def _steps(self, frames: int, last_only: bool) -> list[tuple[int, int]]:
-        """Return the parts, from one frame to another, in which new frames are processed."""
-        first = self._update_frames - self._count % self._update_frames  # up to the next update of the tracks
-        ends = [*range(first, frames, self._update_frames), frames] if last_only else range(1, frames + 1)
-        return [(begin, end) for begin, end in itertools.pairwise([0, *ends]) if end > begin]
 
     def _estimate(self, yaw: float) -> Estimate:
         evidence = self._evidence

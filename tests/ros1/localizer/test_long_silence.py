@@ -1,9 +1,10 @@
-"""Ten minutes of silence between two sounds, without waiting for them; a machine that is busy."""
+"""Ten minutes of silence between two sounds, without waiting for them; a machine that is busy; long blocks."""
 
 from __future__ import annotations
 
 import gc
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -43,6 +44,7 @@ class Robot:
             missing="sound",
             time=lambda frame: SimpleNamespace(ros=rospy.Time.from_sec(START + frame / RATE)),
         )
+        self.updated: Callable[..., None] = lambda *_: None
         self.begun = 0  # how often localization began again
         publishers: Any = SimpleNamespace(begin_again=self._begin_again, publish=self._publish)
         mute: Any = SimpleNamespace(active=False, muted=lambda times: np.zeros(len(times), bool))
@@ -54,6 +56,7 @@ class Robot:
             self.status,
             lambda: None,
             lambda: START + self.index / RATE + self.late,
+            lambda *values: self.updated(*values),
         )
         model = Localizer(RATE, str(head)).model
         window, hop = (round(model.parameters[f"cc_{name}"] * RATE) for name in ("wSizeSec", "hSizeSec"))
@@ -143,3 +146,24 @@ def test_blocks_that_are_late_change_no_source(monkeypatch: pytest.MonkeyPatch, 
     robot.index += 3 * BLOCK
     robot.hear(talker)
     assert robot.begun > begun
+
+
+def test_each_update_of_the_tracks_in_a_long_block_is_used(monkeypatch: pytest.MonkeyPatch, sphere_model: Path) -> None:
+    """The streams get all, as offline; a block, or what waits for a busy localizer, has many."""
+    robot, localizer = Robot(monkeypatch, sphere_model), Localizer(RATE, str(sphere_model))
+    talker = Head.sphere().render(modulated(4.0, 3), RATE, azimuth=40.0)
+    updates = []
+    robot.updated = lambda time, tracks, _: updates.append((time, [track.azimuth for track in tracks]))
+    first, *others = [robot.features(talker[:, begin : begin + BLOCK]) for begin in range(0, 4 * BLOCK, BLOCK)]
+    robot.receive(first)  # whose frames are not used: their numbers follow from the next message
+    for features in others:
+        robot.receive(features)
+    joined = {kind: np.concatenate([features[kind] for features in others], axis=-1) for kind in cues.KINDS}
+    offline = []
+    for begin in range(0, 3 * BLOCK // 160, 10):
+        times = 1.0 + 0.01 * np.arange(begin, begin + 10)
+        localizer.update({kind: array[..., begin : begin + 10] for kind, array in joined.items()}, times)
+        offline.append((localizer.updated_at, [track.azimuth for track in localizer.sources]))
+    assert len(updates) == 30 and any(azimuths for _, azimuths in offline)
+    for (time, azimuths), (expected_time, expected) in zip(updates, offline, strict=True):
+        assert time - START == pytest.approx(expected_time, abs=0.01) and azimuths == pytest.approx(expected, abs=1e-3)

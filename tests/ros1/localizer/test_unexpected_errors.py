@@ -74,6 +74,7 @@ class Fake:
             hop=0.1,
             sources=[],
             updated_at=0.0,
+            update_parts=lambda frames: [slice(frames)],
             reset=lambda keep_noise: self.fail("reset"),
             update=lambda _, times, *__, **___: self.step(
                 "update", {"time": times[-1:], "azimuths": azimuths, "posterior": [azimuths]}
