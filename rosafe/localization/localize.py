@@ -95,7 +95,9 @@ def localize(
         localizer = Localizer(sample_rate, head, seconds, parameters)
         clipped = clipped_samples(view)
         recorder = StreamRecorder(localizer, head_yaw) if streams else None
-        block = max(2, round((UPDATE_SECONDS if streams else _BLOCK_SECONDS) * sample_rate))
+        update_seconds = max(1, round(UPDATE_SECONDS / localizer.hop)) * localizer.hop
+        seconds_of_block = min(UPDATE_SECONDS, update_seconds) if streams else _BLOCK_SECONDS
+        block = max(2, round(seconds_of_block * sample_rate))
         parts = []
         for begin in range(0, max(1, view.shape[1]), block):
             ears = np.ascontiguousarray(view[:, begin : begin + block])
@@ -122,7 +124,7 @@ class StreamRecorder:
     Parameters
     ----------
     localizer : Localizer
-        It has processed a block, of at most `UPDATE_SECONDS`, before the block is added here.
+        It has processed a block, with at most one update of its sources, before the block is added here.
     head_yaw : float or sequence
         As of `localize`.
     """

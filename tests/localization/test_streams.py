@@ -15,7 +15,7 @@ import soundfile
 import rosafe
 from rosafe.commands.__main__ import main
 from rosafe.dsp.resampler import Resampler
-from rosafe.localization import speech
+from rosafe.localization import speech, training
 from rosafe.localization.direction_model import DirectionModel
 from rosafe.localization.filters import HOP, SourceRenderer
 from rosafe.localization.head import Head
@@ -260,6 +260,22 @@ def test_a_file_and_its_streams(
         .startswith("id,time_s,azimuth_deg,azimuth_std_deg,probability,speech\n")
     )
     assert main([*command, str(tmp_path / "other.csv")]) != 0 and "already exists" in capsys.readouterr().err
+
+
+def test_each_position_is_used_with_another_hop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tracks are updated every 90 ms; of two updates in a block the streams had the second one only."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(training, "SOUND_SECONDS", 20.0)
+    used: list[float] = []
+    update = SourceStreams.update
+    monkeypatch.setattr(SourceStreams, "update", lambda *args: (used.append(args[1]), update(*args))[1])
+    hops = dict.fromkeys(("cc_hSizeSec", "ild_hSizeSec", "rm_hSizeSec"), 0.03)
+    sound = Head.sphere().render(modulated(4.0, 3), RATE, azimuth=40.0)
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # without the detector
+        found = rosafe.localize(sound, RATE, parameters=hops, streams=True)
+    times = np.unique(np.concatenate([track["time"] for track in found["tracks"]]))
+    assert len(times) > 30 and set(times) <= set(used)
+    assert np.diff(times).min() == pytest.approx(0.09)
 
 
 def test_refused_sound_and_updates(model: DirectionModel) -> None:
