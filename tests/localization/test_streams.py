@@ -6,6 +6,7 @@ import itertools
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -268,7 +269,12 @@ def test_each_position_is_used_with_another_hop(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(training, "SOUND_SECONDS", 20.0)
     used: list[float] = []
     update = SourceStreams.update
-    monkeypatch.setattr(SourceStreams, "update", lambda *args: (used.append(args[1]), update(*args))[1])
+
+    def record(streams: SourceStreams, time: float, *others: Any) -> None:
+        used.append(time)
+        update(streams, time, *others)
+
+    monkeypatch.setattr(SourceStreams, "update", record)
     hops = dict.fromkeys(("cc_hSizeSec", "ild_hSizeSec", "rm_hSizeSec"), 0.03)
     sound = Head.sphere().render(modulated(4.0, 3), RATE, azimuth=40.0)
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # without the detector
