@@ -171,16 +171,27 @@ def test_columns_are_frames_of_the_port(world: World) -> None:
     assert first / view["rate"] == pytest.approx(end - values.shape[1] / view["rate"], abs=0.02)
 
 
+def filled(columns: np.ndarray) -> np.ndarray:
+    """Return whether each column is equal to the next one."""
+    same = (columns[:, 1:] == columns[:, :-1]) | np.isnan(columns[:, 1:] + columns[:, :-1])
+    return np.append(same.all(axis=0), False)
+
+
 def test_posterior_sources_and_truth_share_a_column(world: World) -> None:
     """Estimates are placed at the time of the audio that their stamp denotes, as is the truth of the scene."""
 
     async def scenario() -> tuple[dict[str, Any], list[tuple[int, int, float, np.ndarray]]]:
         async with page(world.live) as client:
             _, view = await client.subscribe(LEVELS, {"what": "directions"})
+            pieces = client.pieces.setdefault(view["number"], [])
             with localizer(world.graph, offset=10.0):
-                while sum(np.isfinite(piece[3][-8]).sum() for piece in client.pieces.get(view["number"], [])) < 20:
+                while sum(np.isfinite(piece[3][-8]).sum() for piece in pieces) < 40:
+                    before = len(pieces)
                     await client.receive()
-            return view, client.pieces[view["number"]]
+                    held = [filled(piece[3]) for piece in pieces[before:]]
+                    if any((one[1:] & one[:-1]).any() for one in held):
+                        pieces.clear()  # the machine was too busy for the messages of two columns: begin again
+            return view, pieces
 
     view, pieces = asyncio.run(scenario())
     assert (len(view["azimuths"]), view["slots"], view["rows"], view["rate"]) == (72, 8, 72 + 8 * 5 + 8, 10.0)
@@ -205,11 +216,10 @@ def test_posterior_sources_and_truth_share_a_column(world: World) -> None:
     known = np.isfinite(columns[112])
     errors = np.abs(columns[112] - Scene(16000, seconds=5.0).azimuth(np.concatenate(times) + 0.05))[known]
     # On a busy machine a column may have no message of its own. The page fills it with the values of the next one.
-    same = (columns[:, 1:] == columns[:, :-1]) | np.isnan(columns[:, 1:] + columns[:, :-1])
-    filled = np.append(same.all(axis=0), False)[known]
-    assert np.median(errors) < 2.7 and filled.mean() < 0.2
-    assert errors[~filled].max() < 4.5, "a column lasts 0.1 s, in which the source moves by 3.6 degrees"
-    assert errors[filled].max(initial=0.0) < 8.1, "of the next column"
+    held = filled(columns)[known]
+    assert np.median(errors) < 2.7 and held.mean() < 0.2
+    assert errors[~held].max() < 4.5, "a column lasts 0.1 s, in which the source moves by 3.6 degrees"
+    assert errors[held].max(initial=0.0) < 8.1, "of the next column"
 
 
 def test_unsuitable_messages_of_a_localizer_are_ignored() -> None:
