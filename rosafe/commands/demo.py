@@ -199,12 +199,14 @@ async def _run(launcher: Launcher, sound: DemoSound, seconds: float, ports: dict
         _say("loading the setup")
         try:
             await whole_trees.load(afe, write(sound.setup), wait=10.0)
+            rospy.init_node("rosafe_demo", argv=["rosafe_demo"], disable_signals=True, log_level=rospy.FATAL)
+            ports.update((kind, Port(kind)) for kind in CORE_REPRESENTATIONS)
+            await _follow(launcher, bass, sound, seconds, ports)
         except ComponentError:
-            _check(launcher)
+            for _ in range(50):  # the connections of a node that is killed end before its process
+                _check(launcher)
+                await asyncio.sleep(0.02)
             raise
-        rospy.init_node("rosafe_demo", argv=["rosafe_demo"], disable_signals=True, log_level=rospy.FATAL)
-        ports.update((kind, Port(kind)) for kind in CORE_REPRESENTATIONS)
-        await _follow(launcher, bass, sound, seconds, ports)
         for port in ports.values():
             port.reader.close()
 

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
 import shutil
 import signal
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import soundfile
 
+from rosafe.commands import CommandError, demo
 from rosafe.commands.demo import DemoSound, nearest
+from rosafe.interface import ComponentError
 from rosafe.localization import model_cache
+from rosafe.ros1.client import whole_trees
 from rosafe.tree.setups import read, write
 from tests.audio.pulseaudio import PulseServer
 from tests.demo.conftest import SCENE_RATE, Learn
@@ -169,6 +177,27 @@ def test_the_crash_of_a_node_ends_the_demo(node: str, stage: str, tmp_path: Path
         os.kill(next(pid for pid, command in demo.processes().items() if command.endswith(f"/{node} ")), signal.SIGKILL)
         demo.assert_ends(1, f"rosafe demo: {node} has ended: killed by signal 9")
     assert not (tmp_path / "rosafe-demo").exists()
+
+
+def test_a_killed_node_is_named_although_its_connections_end_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    states: Iterator[list[Any]] = iter([[], [], []])  # processes that have ended, after the start and after the error
+
+    class Launcher:
+        async def start_node(self, *_: Any) -> object:
+            return object()
+
+        @property
+        def ended(self) -> list[Any]:
+            return next(states, [SimpleNamespace(name="bass", detail="killed by signal 9")])
+
+    async def load(*_: Any, **__: Any) -> None:
+        raise ComponentError("::genom::mwerr", what="/bass/getAcquisition: not a ROS node")
+
+    monkeypatch.setattr(demo, "open_graph", contextlib.nullcontext)
+    monkeypatch.setattr(whole_trees, "load", load)
+    launcher: Any = Launcher()
+    with pytest.raises(CommandError, match=r"^bass-ros has ended: killed by signal 9$"):
+        asyncio.run(demo._run(launcher, DemoSound("scene:", 16000), 1.0, {}))
 
 
 # --- the installation ---
