@@ -160,12 +160,14 @@ def test_late_messages_lose_nothing(source: ReceivedSource, numbered: bool) -> N
     driver = Driver(source, signal)
     stall = {200: 0.3, 500: 0.15, 800: 0.05}
 
-    def late(number: int) -> float:
+    def stalled(number: int) -> float:
         """Messages of a stall are all published at its end."""
         ends = [begin * 0.01 + seconds for begin, seconds in stall.items() if begin <= number]
-        return max(0.0, *(end - number * 0.01 for end in ends), 0.004 * random.random()) if ends else 0.0
+        return max(0.0, *(end - number * 0.01 for end in ends)) if ends else 0.0
 
-    driver.send(1000, late=late, numbered=numbered)
+    for number in range(1000):
+        driver.send(late=lambda number: max(stalled(number), 0.004 * random.random()), numbered=numbered)
+        assert stalled(number) or source._waiting == driver.number * LENGTH, f"message {number} is held"
     assert np.array_equal(read(source), signal.T) and source.lost_frames == 0 and source.remarks == []
 
 

@@ -83,10 +83,8 @@ class FrameTime:
         """Return whether the system clock has been set, back or forth."""
         if len(self._points) < 2:
             return False
-        if time < line.at(frame) - SET_SECONDS:
-            return True
         if self._last_output is not None and time < self._last_output.at(frame) - SET_SECONDS:
-            return True  # a clock that is much slower than the sound, which the line cannot follow
+            return True  # also a clock that is much slower than the sound, which the line cannot follow
         newest = itertools.islice(reversed(self._points), LATE_BINS)
         return len(self._points) > LATE_BINS and all(stamp > line.at(n) + SET_SECONDS for n, stamp in newest)
 
