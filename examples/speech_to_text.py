@@ -16,7 +16,7 @@ FRONT = math.radians(30)
 BEFORE = 1.0  # s: speech is noticed after its start
 LATE = 3.0  # s, at most: sound arrives after the direction of its time
 parts = deque(maxlen=10000)  # id, time and samples of each part of a stream, for about a minute
-begins = {}  # by id, when those that speak have begun
+begins, ends = {}, {}  # by id, when those that speak have begun, and the others have ended
 ended = deque()  # id, begin and end of utterances
 
 
@@ -49,8 +49,9 @@ def find_speakers(message):
     now = message.header.stamp.to_sec()
     front = {one.id for one in message.sources if one.speech > 0.5 and abs(one.azimuth) < FRONT}
     for id_ in front - begins.keys():
-        begins[id_] = now - BEFORE
+        begins[id_] = max(now - BEFORE, ends.get(id_, 0.0))
     for id_ in begins.keys() - front:
+        ends[id_] = now
         ended.append((id_, begins.pop(id_), now))
     newest = parts[-1][1] if parts else 0.0
     while ended and (newest >= ended[0][2] or now > ended[0][2] + LATE):
