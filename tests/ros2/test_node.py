@@ -151,6 +151,7 @@ def test_parameters_follow_the_processors(ros2: Network, tmp_path: Path) -> None
     wait_for(lambda: client.get("ild.ild_wSizeSec") == 0.03)
     assert client.set(ild__ild_wSizeSec=1, gammatone__fb_nChannels=8) == ["", ""]
     assert client.get("ild.ild_wSizeSec") == 1.0
+    wait_for(lambda: isinstance(client.get("ild.ild_wSizeSec"), float), what="the declared type of a whole number")
     wait_for(lambda: len(client.get("gammatone.fb_cfHz")) == 8)
     client.subscribe("ild")
     wait_for(lambda: client.take("ild")[-1]["shape"][0] == 8)
