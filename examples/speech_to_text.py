@@ -54,10 +54,11 @@ def find_speakers(message):
         ends[id_] = now
         ended.append((id_, begins.pop(id_), now))
     newest = parts[-1][1] if parts else 0.0
-    while ended and (newest >= ended[0][2] or now > ended[0][2] + LATE):
+    while ended and (newest >= ended[0][2] or abs(now - ended[0][2]) > LATE):  # or the clock was set back
         id_, begin, end = ended.popleft()
         heard = [samples for one, time, samples in list(parts) if one == id_ and begin <= time < end]
-        print(id_, recognize(np.concatenate(heard or [np.zeros(0, np.int16)])), flush=True)
+        if heard:
+            print(id_, recognize(np.concatenate(heard)), flush=True)
 
 
 rospy.init_node("speech_to_text")

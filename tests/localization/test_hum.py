@@ -20,14 +20,18 @@ def mains(frequency: float, seconds: float) -> np.ndarray:
     return sum(0.01 / order * np.sin(2 * np.pi * frequency * order * times + order) for order in range(1, 11))
 
 
-@pytest.mark.parametrize("disturbance", ["offset", "50", "60.2"])
+OFFSETS = {"offset": (0.01, QUIET), "large offset": (0.9, QUIET / 10)}  # and the level of the sound
+
+
+@pytest.mark.parametrize("disturbance", [*OFFSETS, "50", "60.2"])
 def test_quiet_sound_is_localized(kemar: rosafe.Head, kemar_model: Path, disturbance: str) -> None:
-    offset = disturbance == "offset"  # nearly full scale: of a smaller one the filters leave little
-    added = np.full(round(1.5 * RATE), 0.9) if offset else mains(float(disturbance), 1.5)
+    """The filters alone leave little of the smaller offset, but not of the large one."""
+    offset, level = OFFSETS.get(disturbance, (0.0, QUIET))
+    added = np.full(round(1.5 * RATE), offset) if offset else mains(float(disturbance), 1.5)
     right = 0
     azimuths = (-150, -120, -60, -30, 30, 60, 90, 120)
     for seed, azimuth in enumerate(azimuths):
-        ears = kemar.render((QUIET / 10 if offset else QUIET) * modulated(1.5, seed), RATE, azimuth)
+        ears = kemar.render(level * modulated(1.5, seed), RATE, azimuth)
         ears = ears + added + 2e-5 * np.random.default_rng(seed).standard_normal(ears.shape)
         found = rosafe.localize(ears, RATE, kemar_model, 1.0)
         right += abs(float(angles.difference(found["azimuth"][-1], azimuth))) <= 5

@@ -149,7 +149,7 @@ def test_blocks_that_are_late_change_no_source(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_each_update_of_the_tracks_in_a_long_block_is_used(monkeypatch: pytest.MonkeyPatch, sphere_model: Path) -> None:
-    """The streams get all, as offline; a block, or what waits for a busy localizer, has many."""
+    """The streams get each of them. A block of one second has ten, as have frames that wait for a busy localizer."""
     robot, localizer = Robot(monkeypatch, sphere_model), Localizer(RATE, str(sphere_model))
     talker = Head.sphere().render(modulated(4.0, 3), RATE, azimuth=40.0)
     updates = []
