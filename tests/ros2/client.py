@@ -75,6 +75,11 @@ class Client:
         return value[FIELDS[value["type"]]] if value["type"] else None
 
 
+def seconds(stamp: dict[str, int]) -> float:
+    """Return a time of ROS in s."""
+    return stamp["sec"] + 1e-9 * stamp["nanosec"]
+
+
 def joined(messages: list[Any]) -> np.ndarray:
     """Return the frames of successive messages as one array; AssertionError if one is missing."""
     arrays = [np.array(one["data"], np.float64).reshape(one["shape"]) for one in messages]

@@ -14,18 +14,13 @@ from tests.harness import Process, freeze, wait_for
 from tests.localization.conftest import MUSIC, TALKER, sphere_model, take
 from tests.streams import Part, ids_of_file
 
-from .client import Client
+from .client import Client, seconds
 from .network import Network
 from .test_dds import dds, ready
 
 __all__ = ["sphere_model", "take"]
 
 STREAMS, SOURCES = "rosafe_msgs/msg/SourceAudio", "rosafe_msgs/msg/SoundSources"
-
-
-def seconds(stamp: dict[str, int]) -> float:
-    """Return a time of ROS in s."""
-    return stamp["sec"] + 1e-9 * stamp["nanosec"]
 
 
 def numbered(message: dict[str, Any]) -> tuple[float, int, list[int]]:
