@@ -192,12 +192,17 @@ def require(scheduler: Scheduler, log: Log, tree: Tree) -> Check:
         for number in range(3):
             source.numbers.append(number)
             source.wake()
-            required = source.required_frames()
-            answers.append((required, source.frames))
+            ask()
 
-    player = scheduler.threading.Thread(play, "player")
-    player.start()
-    player.join()
+    def ask() -> None:
+        required = source.required_frames()
+        answers.append((required, source.frames))
+
+    threads = [scheduler.threading.Thread(run, name) for run, name in ((play, "player"), (ask, "another one"))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
     end(tree)
 
     def check() -> None:
