@@ -261,6 +261,37 @@ async def test_a_burst_of_requests_does_not_lock_out_other_clients(world: World,
             other.writer.transport.abort()
 
 
+def long_request(path: str) -> bytes:
+    """Return a request of 20 kB without its last two bytes."""
+    lines = b"".join(b"x%d: %s\r\n" % (number, b"y" * 3990) for number in range(5))
+    return b"GET /%s HTTP/1.1\r\nHost: localhost\r\n" % path.encode() + lines
+
+
+@in_loop(World, replace(LIMITS, max_header_bytes=50_000))
+async def test_long_requests_together_have_a_limit(world: World, /) -> None:
+    """Of those without an end the oldest is closed; those in progress stay, and a further one is refused."""
+    clients = []
+    for number in range(3):
+        clients.append(await world.connect())
+        clients[-1].writer.write(long_request("poll"))
+        async with asyncio.timeout(PATIENCE):
+            while sum(world.connections.long_requests.values()) < 20_000 * min(2, number + 1):
+                await asyncio.sleep(0.001)
+    assert await clients[0].reader.read() == b""
+    for client in clients[1:]:
+        client.writer.write(b"\r\n")
+        await world.polling.acquire()
+    other = await world.connect()
+    other.writer.write(long_request("now"))
+    assert await other.status() == 503
+    assert await (await world.connect()).get("/now") == 200
+    world.may_answer.set()
+    assert [await client.status() for client in clients[1:]] == [200, 200]
+    other = await world.connect()
+    other.writer.write(long_request("now") + b"\r\n")
+    assert await other.status() == 200
+
+
 @in_loop(World, LIMITS)
 async def test_answers_that_clients_read_slowly_leave_no_memory_for_others(world: World, /) -> None:
     """The same data may be sent to several clients."""
