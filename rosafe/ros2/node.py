@@ -64,6 +64,7 @@ TOPICS = ("sources", "posterior", "poses", "streams", "scene_truth")
 WORLD = "world"  # the coordinate frame of a scene, if none is set
 DIAGNOSTICS_SECONDS = 1.0
 THREADS = 2  # of ROS: one may wait for a device whose sound another one receives
+SIGNAL_SECONDS = 0.2  # between two looks whether a signal has come
 END_SECONDS = 1.0  # that the threads of ROS may take at the end
 PARAMETERS: dict[str, tuple[Any, str]] = {
     "device": ("", "Device to capture from, such as plughw:1,0, file:take.wav, scene: or topic:/audio; empty: none"),
@@ -348,14 +349,24 @@ class RosafeNode:
 
 
 @contextlib.contextmanager
-def _signals(stop: threading.Event) -> Iterator[None]:
-    """Set `stop` at SIGINT and SIGTERM."""
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+def _signals() -> Iterator[list[int]]:
+    """Yield a list that gets SIGINT and SIGTERM. In a handler, Event.set could block: its lock may be held there."""
+    received: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, _: received.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
-        yield
+        yield received
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _wait(received: list[int], stop: threading.Event) -> None:
+    """Wait for a signal or `stop`. A signal just before a system call does not interrupt it, so this looks again."""
+    while not (received or stop.wait(SIGNAL_SECONDS)):
+        pass
 
 
 def _spin(executor: MultiThreadedExecutor, stop: threading.Event) -> None:
@@ -379,12 +390,11 @@ def quoted(arguments: Sequence[str]) -> list[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM, and return its exit code: 1 if it cannot start."""
-    stop = threading.Event()
     arguments = quoted(sys.argv if argv is None else argv)
-    with _signals(stop):
+    with _signals() as received:
         try:
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-            _run(stop)
+            _run(received)
         except (ComponentError, SetupError, ValueError, OSError, RCLError) as problem:
             print(f"rosafe: {printable(' '.join(str(problem).split()))}", file=sys.stderr)
             return 1
@@ -393,8 +403,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _run(stop: threading.Event) -> None:
-    node = RosafeNode()
+def _run(received: list[int]) -> None:
+    node, stop = RosafeNode(), threading.Event()
     executor = MultiThreadedExecutor(THREADS)
     executor.add_node(node.node)
     thread = threading.Thread(target=_spin, args=(executor, stop), name="ROS", daemon=True)
@@ -402,7 +412,7 @@ def _run(stop: threading.Event) -> None:
     try:
         node.begin()
         gc.freeze()  # collecting the objects of modules would stop all threads for tens of milliseconds, without result
-        stop.wait()
+        _wait(received, stop)
     finally:
         stop.set()
         node.close()

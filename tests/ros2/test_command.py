@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands.command import rosafe
-from tests.harness import SCRIPTS, Process, wait_for
+from tests.harness import PYTHON, ROOT, SCRIPTS, Process, wait_for
 
 from .network import Network
 
@@ -63,6 +63,28 @@ def test_doctor_reports_on_ros_2(ros2_env: dict[str, str]) -> None:
     assert (without["state"], without["detail"]) == ("note", "needed only by rosafe ros2: no rclpy in this shell")
     found = check(ros2_env | path)
     assert found["state"] == "ok" and "rmw_fastrtps_cpp" in found["detail"] and "rosafe_msgs" in found["detail"]
+
+
+SIGNALS = """
+import os, random, signal, threading
+from rosafe.ros2.node import _signals, _wait
+for _ in range(500):
+    child = os.fork()
+    if not child:
+        with _signals() as received:
+            signal.signal(signal.SIGALRM, signal.getsignal(signal.SIGTERM))
+            signal.setitimer(signal.ITIMER_REAL, 1e-6 * random.uniform(5, 250))
+            _wait(received, threading.Event())
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+print("all have ended")
+"""
+
+
+def test_a_signal_at_the_start_of_the_wait_for_it(ros2: Network) -> None:
+    """A handler could need a lock of the interrupted wait, or be called when the system call has not begun yet."""
+    process = ros2.start(PYTHON, "-c", SIGNALS, PYTHONPATH=os.pathsep.join((str(ROOT), ros2.env["PYTHONPATH"])))
+    assert process.wait() == 0 and process.out == "all have ended\n", process
 
 
 def test_no_module_of_ros_1(ros2: Network, tmp_path: Path) -> None:
