@@ -67,14 +67,15 @@ def test_doctor_reports_on_ros_2(ros2_env: dict[str, str]) -> None:
 
 SIGNALS = """
 import os, random, signal, threading
-from rosafe.ros2.node import _signals, _wait
+from rosafe.ros2 import node
+node.SIGNAL_SECONDS = 0.002  # otherwise the time of each wait
 for _ in range(500):
     child = os.fork()
     if not child:
-        with _signals() as received:
+        with node._signals() as received:
             signal.signal(signal.SIGALRM, signal.getsignal(signal.SIGTERM))
             signal.setitimer(signal.ITIMER_REAL, 1e-6 * random.uniform(5, 250))
-            _wait(received, threading.Event())
+            node._wait(received, threading.Event())
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0
 print("all have ended")
