@@ -199,7 +199,7 @@ def test_the_example_takes_what_the_talker_says_live_and_from_a_bag(
         acquire(graph, f"file:{take[0]}")
         live = heard(example)
         count = len(parts)
-        enough = parts[-1].header.stamp.to_sec() + 2.5  # a second more than the bag with late sound needs
+        enough = parts[-1].header.stamp.to_sec() + 2.5  # the sound of the late bag is a second late
         wait_for(lambda: len(parts) > count + 150 and parts[-1].header.stamp.to_sec() > enough, what="more sound")
         assert recorder.stop(signal.SIGINT) == 0
         wait_for((tmp_path / "a.bag").exists, what="the end of the recording")  # a child process of rosbag
