@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import re
-from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -215,25 +215,3 @@ def environment() -> dict[str, str]:
     master.set_local_defaults()
     master.check_family()
     return {**os.environ, **generate.environment()}
-
-
-async def until_signal(work: Coroutine[Any, Any, None]) -> int:
-    """Run `work`, which the first ending signal cancels; return the number of the signal, or 0."""
-    from rosafe.ros1.component import startup
-
-    received: list[int] = []
-    task = asyncio.ensure_future(work)
-
-    def stop(number: int) -> None:
-        if not received:  # another one must not interrupt the clean-up
-            task.cancel()
-        received.append(number)
-
-    for number in startup.ending_signals():
-        asyncio.get_running_loop().add_signal_handler(number, stop, number)
-    try:
-        await task
-    except BaseException:  # a library may have converted the cancellation to another exception
-        if not received:
-            raise
-    return received[0] if received else 0

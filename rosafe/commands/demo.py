@@ -60,7 +60,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the demonstration; return 0 on success, 1 after a failure, 128 + number after a signal."""
-    from rosafe.commands._launcher import until_signal
+    from rosafe.ros1.client.asyncio_tools import until_signal
     from rosafe.ros1.transport.paths import writable
 
     existing = next(folder for folder in (options.out, *options.out.absolute().parents) if folder.exists())

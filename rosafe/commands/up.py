@@ -115,7 +115,7 @@ class _Session:
 
     async def run(self) -> None:
         """Run until a signal is received."""
-        from rosafe.commands._launcher import until_signal
+        from rosafe.ros1.client.asyncio_tools import until_signal
 
         show = asyncio.create_task(self._show())
         try:

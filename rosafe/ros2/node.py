@@ -359,8 +359,9 @@ def _signals() -> Iterator[list[int]]:
     try:
         yield received
     finally:
+        # A handler is removed at the end of Python, and another signal would kill the process.
         for number, handler in before.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_IGN if received else handler)
 
 
 def _wait(received: list[int], stop: threading.Event) -> None:

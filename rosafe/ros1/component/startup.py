@@ -148,6 +148,12 @@ def ending_signals() -> list[int]:
     return [number for number in SIGNALS if not (nohup and number == signal.SIGHUP)]
 
 
+def ignore_signals() -> None:
+    """Ignore further ending signals. At its end, Python removes handlers, and a signal would kill the process."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
 # --- command line -----------------------------------------------------------------------------------------------
 
 
@@ -369,6 +375,7 @@ def _serve(node: RosNode, received: list[int]) -> None:
         pass
     systemd.notify("STOPPING=1")
     watchdog(END_SECONDS, 0)
+    ignore_signals()
     rospy.signal_shutdown("signal" if received else "kill")
     ended.wait()  # another thread may be ending it already; the watchdog limits the time
 
