@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -11,7 +12,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from rosafe.audio.devices import SoundSource, open_source
 from rosafe.audio.devices.base import device_error
-from rosafe.audio.devices.received import ReceivedSource
+from rosafe.audio.devices.received import DESCRIPTION_SECONDS, FIRST_SECONDS, ReceivedSource
 from rosafe.ros2.messages import clock_offset
 
 PREFIX = "topic:"
@@ -34,7 +35,11 @@ class TopicSource(ReceivedSource):
             ) from None
         self._node = node
         group = ReentrantCallbackGroup()  # messages arrive while a service waits for them
-        publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(self.topic))
+        # The type and reliability of the subscription have to fit. A node discovers a publisher after some time.
+        end = time.monotonic() + FIRST_SECONDS
+        while not (publishers := node.get_publishers_info_by_topic(node.resolve_topic_name(self.topic))):
+            if time.monotonic() > end or stopping.wait(0.05):
+                break
         stamped = any(one.topic_type.endswith("/AudioDataStamped") for one in publishers)
         reliable = all(one.qos_profile.reliability == ReliabilityPolicy.RELIABLE for one in publishers)
         policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
@@ -54,8 +59,9 @@ class TopicSource(ReceivedSource):
             self._subscriptions.append(
                 node.create_subscription(AudioInfo, info, self._describe, QoSProfile(depth=1), callback_group=group)
             )
+        seconds = DESCRIPTION_SECONDS if self.needs_description else FIRST_SECONDS
         try:
-            self.begin("" if publishers else "the topic has no publisher")
+            self.begin("" if publishers else "the topic has no publisher", seconds if publishers else 0.0)
         except BaseException:
             self.close()
             raise

@@ -6,6 +6,7 @@ import itertools
 import signal
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -100,14 +101,17 @@ def test_stamps_are_times_of_the_clock_of_a_simulation(ros2: Network, tmp_path: 
     assert 999.5 < seconds(newest["header"]["stamp"]) <= 1000  # it stands
 
 
-def test_sound_of_another_driver(ros2: Network, tmp_path: Path) -> None:
+@pytest.mark.parametrize("options", ["?format=S16LE&rate=16000&of=2", ""], ids=["options", "description"])
+def test_sound_of_another_driver(options: str, ros2: Network, tmp_path: Path) -> None:
+    """A driver repeats the description of its format after 5 s."""
     ros2.node("representations:=[ild]", "frames_per_block:=160")
     client, driver = Client(ros2, tmp_path), Client(ros2, tmp_path)
     client.subscribe("ild")
-    message = client.call("acquire", device="topic:/none?format=S16LE&rate=16000&of=2")["message"]
-    assert message.startswith("topic:/none?format=S16LE&rate=16000&of=2: the topic has no publisher; start the driver")
+    message = client.call("acquire", device=f"topic:/none{options}")["message"]
+    assert message.startswith(f"topic:/none{options}: the topic has no publisher; start the driver")
     noise = np.random.default_rng(1).integers(-2000, 2000, 320)
     data = [*np.stack((2 * noise, noise)).T.astype("<i2").tobytes()]
+    description = {"channels": 2, "sample_rate": RATE, "sample_format": "S16LE", "coding_format": "wave"}
     finished = threading.Event()
 
     def drive() -> None:
@@ -119,17 +123,18 @@ def test_sound_of_another_driver(ros2: Network, tmp_path: Path) -> None:
             if finished.wait(max(0.0, begin + start / RATE - time.time())):
                 return
             driver.ask("publish", kind="audio_common_msgs/msg/AudioDataStamped", topic="/audio", fields=fields)
+            if start == 5 * RATE and not options:
+                driver.ask("publish", kind="audio_common_msgs/msg/AudioInfo", topic="/audio_info", fields=description)
 
-    threading.Thread(target=drive, daemon=True).start()
-    try:
-        wait_for(lambda: "/audio" in client.ask("topics"))
-        assert client.call("acquire", device="topic:/audio?format=S16LE&rate=16000&of=2") == {
-            "success": True,
-            "message": "",
-        }
-        found = joined(client.take("ild", 40))
-    finally:
-        finished.set()
+    with ThreadPoolExecutor() as pool:
+        try:
+            # It begins before the node knows the publisher and its type.
+            acquired = pool.submit(client.call, "acquire", device=f"topic:/audio{options}")
+            threading.Thread(target=drive, daemon=True).start()  # it waits for a subscriber
+            assert acquired.result() == {"success": True, "message": ""}
+            found = joined(client.take("ild", 40))
+        finally:
+            finished.set()
     assert np.allclose(found[:, 5:], -20 * np.log10(2), atol=0.01)
 
 

@@ -669,7 +669,7 @@ class ReceivedSource(ReceivedSound):
         Parameters
         ----------
         absent : str
-            Why no message can arrive, such as a topic without a publisher, for the error; it is not waited for then.
+            Why no message can arrive, such as a topic without a publisher, for the error.
         seconds : float
             To wait at most.
 
