@@ -9,6 +9,7 @@ from typing import Any
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from rosafe.audio.devices import SoundSource, open_source
 from rosafe.audio.devices.base import device_error
@@ -35,11 +36,7 @@ class TopicSource(ReceivedSource):
             ) from None
         self._node = node
         group = ReentrantCallbackGroup()  # messages arrive while a service waits for them
-        # The type and reliability of the subscription have to fit. A node discovers a publisher after some time.
-        end = time.monotonic() + FIRST_SECONDS
-        while not (publishers := node.get_publishers_info_by_topic(node.resolve_topic_name(self.topic))):
-            if time.monotonic() > end or stopping.wait(0.05):
-                break
+        publishers = self._find_publishers(stopping)
         stamped = any(one.topic_type.endswith("/AudioDataStamped") for one in publishers)
         reliable = all(one.qos_profile.reliability == ReliabilityPolicy.RELIABLE for one in publishers)
         policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
@@ -65,6 +62,14 @@ class TopicSource(ReceivedSource):
         except BaseException:
             self.close()
             raise
+
+    def _find_publishers(self, stopping: threading.Event) -> list[TopicEndpointInfo]:
+        """Return the publishers, whose type and reliability matter; the node discovers them after some time."""
+        topic, end = self._node.resolve_topic_name(self.topic), time.monotonic() + FIRST_SECONDS
+        while not (found := self._node.get_publishers_info_by_topic(topic)):
+            if time.monotonic() > end or stopping.wait(0.05):
+                break
+        return found
 
     def _describe(self, info: Any) -> None:
         self.describe(info.channels, info.sample_rate, info.sample_format, info.coding_format)
