@@ -1,4 +1,4 @@
-"""Helpers for tasks and events of asyncio, and the set-up of the event loop of a server."""
+"""Helpers for tasks and events of asyncio, ending signals, and the set-up of the event loop of a server."""
 
 from __future__ import annotations
 
