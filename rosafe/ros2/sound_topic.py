@@ -18,6 +18,7 @@ from rosafe.ros2.messages import clock_offset
 
 PREFIX = "topic:"
 INFO = "audio_info"  # the topic beside that of the sound that describes its format
+PLAIN, STAMPED = "audio_common_msgs/msg/AudioData", "audio_common_msgs/msg/AudioDataStamped"
 QUEUE = 1000  # messages
 NOT_NUMBERED = 2**64 - 1
 
@@ -37,7 +38,7 @@ class TopicSource(ReceivedSource):
         self._node = node
         group = ReentrantCallbackGroup()  # messages arrive while a service waits for them
         publishers = self._find_publishers(stopping)
-        stamped = any(one.topic_type.endswith("/AudioDataStamped") for one in publishers)
+        stamped = any(one.topic_type == STAMPED for one in publishers)
         reliable = all(one.qos_profile.reliability == ReliabilityPolicy.RELIABLE for one in publishers)
         policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
         qos = QoSProfile(depth=QUEUE, reliability=policy)
@@ -56,9 +57,8 @@ class TopicSource(ReceivedSource):
             self._subscriptions.append(
                 node.create_subscription(AudioInfo, info, self._describe, QoSProfile(depth=1), callback_group=group)
             )
-        seconds = DESCRIPTION_SECONDS if self.needs_description else FIRST_SECONDS
         try:
-            self.begin("" if publishers else "the topic has no publisher", seconds if publishers else 0.0)
+            self.begin("", DESCRIPTION_SECONDS if self.needs_description else FIRST_SECONDS)
         except BaseException:
             self.close()
             raise
@@ -68,8 +68,11 @@ class TopicSource(ReceivedSource):
         topic, end = self._node.resolve_topic_name(self.topic), time.monotonic() + FIRST_SECONDS
         while not (found := self._node.get_publishers_info_by_topic(topic)):
             if time.monotonic() > end or stopping.wait(0.05):
-                break
-        return found
+                self.begin("the topic has no publisher", 0.0)
+        used = [one for one in found if one.topic_type in (PLAIN, STAMPED)]
+        if not used:
+            self.begin(f"messages of type {found[0].topic_type} are not used", 0.0)
+        return used
 
     def _describe(self, info: Any) -> None:
         self.describe(info.channels, info.sample_rate, info.sample_format, info.coding_format)

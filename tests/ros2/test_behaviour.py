@@ -109,6 +109,8 @@ def test_sound_of_another_driver(options: str, ros2: Network, tmp_path: Path) ->
     client.subscribe("ild")
     message = client.call("acquire", device=f"topic:/none{options}")["message"]
     assert message.startswith(f"topic:/none{options}: the topic has no publisher; start the driver")
+    message = client.call("acquire", device=f"topic:/rosout{options}")["message"]
+    assert message.startswith(f"topic:/rosout{options}: messages of type rcl_interfaces/msg/Log are not used; start")
     noise = np.random.default_rng(1).integers(-2000, 2000, 320)
     data = [*np.stack((2 * noise, noise)).T.astype("<i2").tobytes()]
     description = {"channels": 2, "sample_rate": RATE, "sample_format": "S16LE", "coding_format": "wave"}
