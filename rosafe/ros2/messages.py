@@ -19,6 +19,7 @@ from rosafe_msgs.msg import SceneTruth
 from tf2_msgs.msg import TFMessage
 
 from rosafe.localization.rotations import RotationBuffer
+from rosafe.system.clocks import clock_difference
 
 MAX_SECONDS = 2**31 - 1  # since 1970, of a time of ROS 2
 
@@ -32,7 +33,9 @@ def ros_time(seconds: float) -> Time:
 def clock_offset(node: Node) -> float:
     """Return by how much the clock of a node is ahead of the system's (s); 0 without `use_sim_time`."""
     clock = node.get_clock()
-    return clock.now().nanoseconds / 1e9 - time.time() if clock.ros_time_is_active else 0.0
+    if not clock.ros_time_is_active:
+        return 0.0
+    return clock_difference(lambda: clock.now().nanoseconds / 1e9, time.time)
 
 
 def numbers(values: Any) -> array.array[float]:

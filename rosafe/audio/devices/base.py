@@ -15,6 +15,7 @@ import numpy as np
 
 from rosafe import interface
 from rosafe.interface import ComponentError
+from rosafe.system.clocks import wall_difference
 
 
 class Chunk(NamedTuple):
@@ -30,7 +31,7 @@ def wall_time_ns(moment: float) -> int:
 
     The current wall clock is used, so the result follows when the clock is set.
     """
-    return time.time_ns() - int((time.monotonic() - moment) * 1e9)
+    return round((moment + wall_difference()) * 1e9)
 
 
 def loss_text(frames: int, index: int, sample_rate: int) -> str:

@@ -27,6 +27,7 @@ from rosafe.audio.devices.base import (
 from rosafe.audio.files.audiofile import NOT_FINITE, channel_pair, to_int32
 from rosafe.audio.files.windows import MAX_JUMP_SECONDS
 from rosafe.interface import BASS, ComponentError
+from rosafe.system.clocks import wall_difference
 from rosafe.system.option_types import whole_number
 
 BYTES = {"S16LE": 2, "S24LE": 3, "S32LE": 4, "F32LE": 4}  # in a sample
@@ -36,7 +37,7 @@ MAX_WAITING = 2**24  # received frames that wait to be read, 128 MB; further fra
 PAUSE_SECONDS = 1.0  # without a message, until the source reports a pause
 FIRST_SECONDS = 3.0  # timeout for the first message
 DESCRIPTION_SECONDS = 6.0  # the same with a description of the format, which drivers repeat every 5 s
-_CLOCK = time.time() - time.monotonic()  # of times of arrival, which no change of the clock may alter
+_CLOCK = wall_difference()  # of times of arrival, which no change of the clock may alter
 _UNCODED = ("", "wave", "wav", "raw", "pcm")
 _CODED = {b"ID3": "MP3", b"OggS": "Ogg", b"fLaC": "FLAC", b"RIFF": "a WAV file"}  # by their first bytes
 _SNIFFED = 8  # messages in which coded sound is detected
@@ -396,7 +397,7 @@ class ReceivedSound:
     def _monotonic(self) -> float:
         """Return when the last frame of the chunk that was taken was captured."""
         captured = self._taken[0] - self._pending / max(1, self.sample_rate)
-        return time.monotonic() - (time.time() - captured)
+        return captured - wall_difference()
 
     def close(self) -> None:
         """Release the source."""

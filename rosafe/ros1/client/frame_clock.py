@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from rosafe.declarations.checks import is_number
 from rosafe.declarations.text import short_repr
+from rosafe.system.clocks import clock_difference
 
 MAX_LINES = 600  # lines of a FrameClock: at least two minutes with the default block
 MAX_RATE = 1_000_000.0  # Hz
@@ -157,10 +158,10 @@ class FrameClock:
             return f"{self.topic}: sampleRate: expected a number from 1 to {MAX_RATE:g} Hz, got {rate:g}"
         if wall >= MAX_TIME:
             return f"{self.topic}: stamp: expected a time below {MAX_TIME:.0f} s, got {wall:.0f}"
-        now, ros_now = time.time(), self._rospy.get_time()
+        ahead, late = clock_difference(self._rospy.get_time, time.time), time.time() - wall
         # Stamps from rosbag play are ROS time; stamps from capture are wall-clock time.
-        recorded = abs(wall - ros_now) <= abs(wall - now)
-        line = _Line(frame, wall, rate, 0.0 if recorded else ros_now - now)
+        recorded = abs(late + ahead) <= abs(late)
+        line = _Line(frame, wall, rate, 0.0 if recorded else ahead)
         with self._arrived:
             if self._lines and line.frame <= self._lines[-1].frame:  # a new stream
                 self._lines.clear()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
@@ -220,6 +221,22 @@ def published(graph: Graph) -> Iterator[tuple[FrameClock, Callable[..., None]]]:
     yield clock, publish
     clock.close()
     publisher.unregister()
+
+
+def test_a_thread_that_waits_between_two_clocks(published: tuple[FrameClock, Callable[..., None]]) -> None:
+    """ROS time is that of the system; a wait between the readings of both is no difference."""
+    clock, publish = published
+    waits = iter((0.02, 0.02))
+
+    def get_time() -> float:
+        time.sleep(next(waits, 0.0))
+        return rospy.get_time()
+
+    clock._rospy = SimpleNamespace(get_time=get_time, Time=rospy.Time)
+    now = time.time()
+    publish(1000, 44100.0, now)
+    wait_for(lambda: clock.covers(1000, 1))
+    assert clock.time(1000).ros.to_sec() == pytest.approx(now, abs=1e-3, rel=0)
 
 
 def test_a_sound_card_that_runs_slightly_fast(published: tuple[FrameClock, Callable[..., None]]) -> None:
