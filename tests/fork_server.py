@@ -120,7 +120,8 @@ class ForkedProcess:
     def send_signal(self, number: int) -> None:
         """Send a signal, unless the process has ended."""
         if self.poll() is None:
-            os.kill(self.pid, number)
+            with contextlib.suppress(ProcessLookupError):  # meanwhile
+                os.kill(self.pid, number)
 
     def _result(self, timeout: float | None) -> int | None:
         with self._lock:

@@ -222,6 +222,14 @@ class Process:
             self._popen.send_signal(number)
         return self.wait(timeout)
 
+    def stop_impatiently(self, number: int, send: Callable[[int, int], None] = os.kill) -> int:
+        """Send a signal again and again until the process has ended; return the exit code."""
+        while self.alive:
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                send(self.pid, number)
+            time.sleep(0.001)
+        return self.wait()
+
     def close(self) -> None:
         """End the process and its children, with SIGKILL if SIGTERM has no effect."""
         if self.alive:

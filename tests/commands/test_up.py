@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import signal
-import time
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +65,7 @@ def test_start_and_end_of_all_processes(alone: Graph, tmp_path: Path) -> None:
                 os.kill(running.pid, signal.SIGKILL)
                 running.wait()
             else:
-                while running.alive:  # a user may press it several times
-                    os.kill(running.pid, signal.SIGINT)
-                    time.sleep(0.001)
-                assert running.wait() == 0 and not answers(alone.uri), running
+                assert running.stop_impatiently(signal.SIGINT) == 0 and not answers(alone.uri), running
             wait_for(lambda: not answers(alone.uri), what="the end of the master")
 
 

@@ -8,7 +8,6 @@ import os
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -154,9 +153,7 @@ def test_signal(stage: str, number: signal.Signals, tmp_path: Path, sound: Path)
     """A terminal sends it repeatedly to the whole process group, until the end."""
     with RunningDemo(sound, cwd=tmp_path) as demo:
         demo.wait_for_output(STAGES[stage])
-        while demo.alive:
-            os.killpg(demo.pid, number)
-            time.sleep(0.001)
+        demo.stop_impatiently(number, os.killpg)
         demo.assert_ends(128 + number)
     assert stage == "recording" or STAGES["recording"] not in demo.out
     assert not (tmp_path / "rosafe-demo").exists()

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rosgraph
 import rospy
 import soundfile
 from std_msgs.msg import String
@@ -34,12 +33,6 @@ from tests.ros1.afe.session import Session, noise
 CHAIN = ("PreProc", "GammatoneProc", "IhcProc", "IldProc", "RatemapProc", "CrossCorrelationProc")
 BLOCK = 8000  # each processor takes longer for it than the pool's threshold for a second worker
 BLOCKS = 20
-
-
-def listening(graph: Graph, topic: str) -> bool:
-    return topic in {
-        name for name, nodes in rosgraph.Master("/test", master_uri=graph.uri).getSystemState()[1] if nodes
-    }
 
 
 def spans(path: Path, of_workers: bool = False) -> dict[str, list[tuple[str, int | None, int, int]]]:
@@ -67,7 +60,8 @@ def test_a_real_run_shows_simultaneous_parents_children_and_siblings(afe: Sessio
     path = tmp_path / "trace.json"
     command = afe.graph.start(str(SCRIPTS / "rosafe"), "trace", "--seconds", "100", "-o", str(path))
     with command:
-        wait_for(lambda: listening(afe.graph, "/rosAFE/trace"))
+        wait_for(lambda: afe.connections("/rosAFE/trace"))
+        afe.graph.message("/rosAFE/trace", String)  # it has begun
         with afe.follow("ild") as messages:
             microphone.play(noise(BLOCK * BLOCKS))
             wait_for(lambda: messages[-1].lastFrameIndex == BLOCK * BLOCKS + 1)

@@ -7,7 +7,6 @@ import re
 import signal
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -386,10 +385,7 @@ def test_a_script_may_start_a_node_in_the_background(graph: Graph) -> None:
     """In a script, a command with `&` ignores SIGINT."""
     with graph.start("sh", "-c", "trap '' INT QUIT; exec bass-ros") as node:
         wait_for(lambda: "/bass/kill" in graph.services(), what=lambda: str(node))
-        while node.alive:  # an impatient user
-            os.kill(node.pid, signal.SIGINT)
-            time.sleep(0.001)
-        assert node.wait() == 0
+        assert node.stop_impatiently(signal.SIGINT) == 0
 
 
 def test_the_shells_process_is_the_node(graph: Graph) -> None:
