@@ -105,7 +105,7 @@ class TruthTopics:
 
     def publish(self, frame: int, moment: float, truth: Any) -> None:
         """Publish the truth at an audio frame, whose time is on the clock of time.monotonic."""
-        stamp = ros_time(self._now() - (time.monotonic() - moment))
+        stamp = ros_time(moment + clock_difference(self._now, time.monotonic))
         yaw = math.radians(truth.head_yaw)
         azimuths = [math.radians(azimuth) for azimuth in truth.azimuths]
         message = SceneTruth(stamp=stamp, frame_index=frame, head_yaw=yaw, azimuths=azimuths)

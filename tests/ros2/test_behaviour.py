@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import json
+import os
 import signal
 import threading
 import time
@@ -14,7 +16,7 @@ import numpy as np
 import pytest
 
 from rosafe.ros1.transport.paths import PYPI_DIR
-from tests.harness import PATIENCE, wait_for
+from tests.harness import PATIENCE, ROOT, wait_for
 
 from .client import Client, joined, seconds
 from .network import Network
@@ -99,6 +101,38 @@ def test_stamps_are_times_of_the_clock_of_a_simulation(ros2: Network, tmp_path: 
     frame = client.take("ild")[-1]["first_frame"]
     newest = wait_for(lambda: next((one for one in client.take("ild") if one["first_frame"] > frame + 200), None))
     assert 999.5 < seconds(newest["header"]["stamp"]) <= 1000  # it stands
+
+
+WAITS = """
+import json, time
+from types import SimpleNamespace
+from rosafe.ros2 import messages
+from rosafe.system.clocks import wall_difference
+
+def now():
+    value = time.time()
+    time.sleep(next(waits, 0.0))
+    return value
+
+sent = []
+publisher = SimpleNamespace(publish=sent.append)
+topics = messages.TruthTopics(SimpleNamespace(create_publisher=lambda *_: publisher), ("map", "ears"), now)
+moment = time.monotonic()
+wall = moment + wall_difference()
+waits = iter([0.03])
+topics.publish(1, moment, SimpleNamespace(head_yaw=0, azimuths=[], names=[]))
+stamp = sent[0].stamp
+waits = iter([0.03])
+clock = SimpleNamespace(ros_time_is_active=True, now=lambda: SimpleNamespace(nanoseconds=round(now() * 1e9)))
+offset = messages.clock_offset(SimpleNamespace(get_clock=lambda: clock))
+print(json.dumps([stamp.sec + 1e-9 * stamp.nanosec - wall, offset]))
+"""
+
+
+def test_a_thread_that_waits_between_two_clocks(ros2: Network) -> None:
+    process = ros2.python(WAITS, PYTHONPATH=os.pathsep.join((str(ROOT), ros2.env["PYTHONPATH"])))
+    assert process.wait() == 0, process
+    assert json.loads(process.out) == pytest.approx([0, 0], abs=5e-3), "s"
 
 
 @pytest.mark.parametrize("options", ["?format=S16LE&rate=16000&of=2", ""], ids=["options", "description"])
