@@ -222,7 +222,7 @@ class Process:
             self._popen.send_signal(number)
         return self.wait(timeout)
 
-    def stop_impatiently(self, number: int, send: Callable[[int, int], None] = os.kill) -> int:
+    def signal_until_end(self, number: int, send: Callable[[int, int], None] = os.kill) -> int:
         """Send a signal again and again until the process has ended; return the exit code."""
         while self.alive:
             with contextlib.suppress(ProcessLookupError):  # it has just ended

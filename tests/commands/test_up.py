@@ -65,7 +65,7 @@ def test_start_and_end_of_all_processes(alone: Graph, tmp_path: Path) -> None:
                 os.kill(running.pid, signal.SIGKILL)
                 running.wait()
             else:
-                assert running.stop_impatiently(signal.SIGINT) == 0 and not answers(alone.uri), running
+                assert running.signal_until_end(signal.SIGINT) == 0 and not answers(alone.uri), running
             wait_for(lambda: not answers(alone.uri), what="the end of the master")
 
 

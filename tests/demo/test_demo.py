@@ -153,7 +153,7 @@ def test_signal(stage: str, number: signal.Signals, tmp_path: Path, sound: Path)
     """A terminal sends it repeatedly to the whole process group, until the end."""
     with RunningDemo(sound, cwd=tmp_path) as demo:
         demo.wait_for_output(STAGES[stage])
-        demo.stop_impatiently(number, os.killpg)
+        demo.signal_until_end(number, os.killpg)
         demo.assert_ends(128 + number)
     assert stage == "recording" or STAGES["recording"] not in demo.out
     assert not (tmp_path / "rosafe-demo").exists()

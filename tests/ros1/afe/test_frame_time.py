@@ -224,7 +224,7 @@ def published(graph: Graph) -> Iterator[tuple[FrameClock, Callable[..., None]]]:
 
 
 def test_a_thread_that_waits_between_two_clocks(published: tuple[FrameClock, Callable[..., None]]) -> None:
-    """ROS time is that of the system; a wait between the readings of both is no difference."""
+    """ROS time is that of the system, also if the thread waits between the readings of both clocks."""
     clock, publish = published
     waits = iter((0.02, 0.02))
 

@@ -385,7 +385,7 @@ def test_a_script_may_start_a_node_in_the_background(graph: Graph) -> None:
     """In a script, a command with `&` ignores SIGINT."""
     with graph.start("sh", "-c", "trap '' INT QUIT; exec bass-ros") as node:
         wait_for(lambda: "/bass/kill" in graph.services(), what=lambda: str(node))
-        assert node.stop_impatiently(signal.SIGINT) == 0
+        assert node.signal_until_end(signal.SIGINT) == 0
 
 
 def test_the_shells_process_is_the_node(graph: Graph) -> None:

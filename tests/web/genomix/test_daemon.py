@@ -66,7 +66,7 @@ def test_a_signal_ends_it_regardless_of_clients(home_graph: harness.Graph, numbe
         kept = socket.create_connection(("127.0.0.1", port))
         kept.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert kept.recv(10) == b"HTTP/1.1 2"
-        assert process.stop_impatiently(number) == 0
+        assert process.signal_until_end(number) == 0
         assert next(events) == ("quit", "")
         kept.close()
         assert "Traceback" not in process.err
