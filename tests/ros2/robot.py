@@ -16,6 +16,7 @@ from typing import Any
 
 import rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 
 
 def find(name: str) -> Any:
@@ -107,7 +108,7 @@ class Robot:
 
 
 def main() -> None:
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # those of rclpy end it with a segmentation fault
     robot = Robot("robot")
     server = socket.socket(socket.AF_UNIX)
     server.bind(sys.argv[1] + ".new")

@@ -140,14 +140,14 @@ def test_full_disk(wav: Path, tmp_path: Path) -> None:
 
 
 def test_live_line_on_a_terminal(tmp_path: Path) -> None:
-    command = [str(ROSAFE), "record", "a.wav", "--device", "scene:", "--seconds", "0.6", "--chunk", "441"]
+    command = [str(ROSAFE), "record", "a.wav", "--device", "scene:", "--seconds", "1.4", "--chunk", "441"]
     with Terminal(command, environment(), cwd=tmp_path, columns=80) as terminal:
         assert terminal.end() == 0
         text = terminal.sent
     looks = text.split("\r\x1b[K")
     assert len(looks) > 4
     assert re.search(r"0:01  L \[#+-*\|?-*\] +-[\d.]+/ *-[\d.]+ +R \[.*\] .*  lost 0$", looks[-2])
-    assert max(map(len, looks[:-1])) == 79 and looks[-1].startswith("a.wav: 0.600 s")
+    assert max(map(len, looks[:-1])) == 79 and looks[-1].startswith("a.wav: 1.400 s")
 
 
 def test_reader_of_the_meter_closes_the_pipe(tmp_path: Path) -> None:
