@@ -26,6 +26,7 @@ class Client:
         self.process = ros2.start(PYTHON, "-u", Path(__file__).with_name("robot.py"), path)
         wait_for(lambda: path.exists() or not self.process.alive, what=lambda: repr(self.process))
         self.node = node
+        self._network = ros2
         connection = socket.socket(socket.AF_UNIX)
         connection.connect(str(path))
         self._lines = connection.makefile("rw")
@@ -44,7 +45,16 @@ class Client:
             "request": "rosafe_msgs/srv/RequestRepresentation",
             "stop": "std_srvs/srv/Trigger",
         }.get(service, f"rosafe_msgs/srv/{service.title().replace('_', '')}")
-        return self.ask("call", kind=kind, name=f"{self.node}/{service}", fields=fields)
+        return self._call(kind, service, fields)
+
+    def _call(self, kind: str, service: str, fields: dict[str, Any]) -> Any:
+        """Call a service, again if Fast DDS drops the answer because it has not found the client within 0.1 s."""
+        arguments = {"kind": kind, "name": f"{self.node}/{service}", "fields": fields}
+        answer = self.ask("call", **arguments)
+        if answer is None and "client will not receive response" in self._network.errors:
+            answer = self.ask("call", **arguments)
+        assert answer is not None, f"{service}: no answer\n{self._network.errors}"
+        return answer
 
     def subscribe(self, topic: str, kind: str = "rosafe_msgs/msg/Representation", **options: Any) -> None:
         """Subscribe to a topic of the node."""
@@ -65,13 +75,13 @@ class Client:
             for name, value in parameters.items()
         ]
         kind = "rcl_interfaces/srv/SetParameters"
-        answer = self.ask("call", kind=kind, name=f"{self.node}/set_parameters", fields={"parameters": values})
+        answer = self._call(kind, "set_parameters", {"parameters": values})
         return ["" if one["successful"] else one["reason"] or "?" for one in answer["results"]]
 
     def get(self, name: str) -> Any:
         """Return a parameter; None if there is none."""
         kind, fields = "rcl_interfaces/srv/GetParameters", {"names": [name]}
-        (value,) = self.ask("call", kind=kind, name=f"{self.node}/get_parameters", fields=fields)["values"]
+        (value,) = self._call(kind, "get_parameters", fields)["values"]
         return value[FIELDS[value["type"]]] if value["type"] else None
 
 

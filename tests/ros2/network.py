@@ -72,6 +72,11 @@ class Network:
         given = [word for parameter in parameters for word in ("-p", parameter)]
         return self.start(SCRIPTS / "rosafe", "ros2", "--ros-args", *given, *arguments, **env)
 
+    @property
+    def errors(self) -> str:
+        """What the programs have written to stderr."""
+        return "".join(process.err for process in self._processes)
+
     def close(self) -> None:
         """End all programs."""
         for process in self._processes:

@@ -93,13 +93,13 @@ class Robot:
         publisher.publish(fill(find(kind)(), fields))
 
     def call(self, kind: str, name: str, fields: Any, seconds: float = 40.0) -> Any:
-        """Call a service."""
+        """Call a service; None without an answer within a time."""
         service = self.services.setdefault(name, self.node.create_client(find(kind), name))
         if not service.wait_for_service(seconds):
             raise TimeoutError(name)
         future = service.call_async(fill(find(kind).Request(), fields))
         rclpy.spin_until_future_complete(self.node, future, timeout_sec=seconds)
-        return plain(future.result())
+        return plain(future.result()) if future.done() else None
 
     def topics(self) -> dict[str, list[str]]:
         """Return all topics with their types."""
