@@ -74,7 +74,7 @@ class Network:
 
     @property
     def errors(self) -> str:
-        """What the programs have written to stderr."""
+        """The standard error output of all programs."""
         return "".join(process.err for process in self._processes)
 
     def close(self) -> None:
