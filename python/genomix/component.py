@@ -7,7 +7,9 @@ import difflib
 import inspect
 import json
 import keyword
+import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -85,9 +87,11 @@ def _service(client: Client, about: dict[str, Any], name: str, service: dict[str
         ack, callback = options.get("ack"), options.get("callback")
         if not ack and not callback and not service["activity"]:
             return _outputs(full_name, client.get(f"/call/{place}", **query, **form))
-        request = Request(client, full_name, client.send(f"/send/{place}", **query), form)
+        request = _sent(
+            lambda: Request(client, full_name, client.send(f"/send/{place}", **query), form),
+            lambda request: request.wait_for_start() if ack else None if callback else request.wait(),
+        )
         if ack or not callback:
-            _wait(request, bool(ack))
             request.show_warning()
         if (ack and request.status is Status.error) or not (ack or callback):
             return request.result or {}  # or raises its error
@@ -100,17 +104,30 @@ def _service(client: Client, about: dict[str, Any], name: str, service: dict[str
     return method
 
 
-def _wait(request: Request, ack: bool) -> None:
-    """Wait for the end of an activity, or its start; an exception, such as Ctrl-C, aborts it."""
+def _sent(send: Callable[[], Request], wait: Callable[[Request], object]) -> Request:
+    """Send a request and wait; an exception, such as Ctrl-C, aborts the activity.
+
+    It is sent on a thread, which Ctrl-C does not interrupt: without the answer there is no number to abort.
+    """
+    sending: Future[Request] = Future()
+
+    def work() -> None:
+        if sending.set_running_or_notify_cancel():
+            try:
+                sending.set_result(send())
+            except BaseException as problem:
+                sending.set_exception(problem)
+
     try:
-        if ack:
-            request.wait_for_start()
-        else:
-            request.wait()
+        threading.Thread(target=work, name="genomix", daemon=True).start()
+        request = sending.result()
+        wait(request)
     except BaseException:
-        with contextlib.suppress(GenoMError):
-            request.abort()
+        if not sending.cancel():
+            with contextlib.suppress(GenoMError):
+                sending.result().abort()
         raise
+    return request
 
 
 def _port(client: Client, about: dict[str, Any], name: str, port: dict[str, Any]) -> Callable[..., Any]:

@@ -134,8 +134,9 @@ class ActionClient:
 
     async def _send_until_seen(self, goal: Goal, message: Any) -> None:
         while not goal.seen.is_set():
-            # A result is sent once, and not to later subscribers: send the goal only when all topics are connected.
-            if all(topic.get_num_connections() for topic in (*self._subscribers, self._publishers["goal"])):
+            # A result is sent once, as is a cancellation, and not to later subscribers: send the goal only when all
+            # topics are connected.
+            if all(topic.get_num_connections() for topic in (*self._subscribers, *self._publishers.values())):
                 self._publishers["goal"].publish(message)
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(goal.seen.wait(), REPEAT_SECONDS)

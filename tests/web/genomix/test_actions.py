@@ -56,12 +56,12 @@ async def action_of_bass() -> AsyncIterator[Action]:
     await graph.close()
 
 
-@pytest.mark.parametrize("missing", ["goal", "result", "status"])
+@pytest.mark.parametrize("missing", ["goal", "cancel", "result", "status"])
 @in_loop(action_of_bass)
-async def test_a_goal_is_sent_when_its_result_can_be_received(
+async def test_a_goal_is_sent_when_all_topics_are_connected(
     action: Action, /, monkeypatch: pytest.MonkeyPatch, missing: str
 ) -> None:
-    """A result is sent once: a client that is not connected yet would miss it."""
+    """A result and a cancellation are sent once: who is not connected yet would miss them."""
     monkeypatch.setattr(actions, "REPEAT_SECONDS", 0.01)
     for topic in (action.goal, action.cancel, action.result, action.status):
         topic.connections = 1

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import copy
+import http.client
 import inspect
 import math
 import multiprocessing
 import pickle
 import re
 import signal
+import threading
 import wave
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import genomix
 import pytest
@@ -280,6 +282,23 @@ def test_an_interrupt_before_the_start_aborts_the_activity(g: genomix.Client, mo
         patch.setattr(genomix.Request, "wait_for_start", interrupted)
         bass.Acquire("scene:", ack=True)
     assert g.get("/request/wait", id=ids[0], ms="60000")["status"] != "sent"
+
+
+def test_an_interrupt_before_the_answer_aborts_the_activity(world: World, g: genomix.Client) -> None:
+    """genomixd answers after the activity has begun, and Ctrl-C arrives between the two."""
+    bass = g.load("bass")
+    answer = http.client.HTTPConnection.getresponse
+
+    def delayed(connection: http.client.HTTPConnection) -> http.client.HTTPResponse:
+        patch.undo()
+        harness.wait_for(lambda: live_activities(world, "bass"), what="start of the capture")
+        signal.pthread_kill(cast(int, threading.main_thread().ident), signal.SIGINT)
+        return answer(connection)
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(http.client.HTTPConnection, "getresponse", delayed)
+        bass.Acquire("scene:")
+    harness.wait_for(lambda: not live_activities(world, "bass"), what="end of the capture")
 
 
 def test_threads_share_a_connection(g: genomix.Client) -> None:
