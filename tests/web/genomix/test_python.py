@@ -295,6 +295,7 @@ def test_an_interrupt_before_the_answer_aborts_the_activity(world: World, g: gen
         signal.pthread_kill(cast(int, threading.main_thread().ident), signal.SIGINT)
         return answer(connection)
 
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # the tests may have started with SIGINT ignored
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(http.client.HTTPConnection, "getresponse", delayed)
         bass.Acquire("scene:")
