@@ -307,7 +307,7 @@ class Graph:
                 name = value
         self._forget(f"/{name}")
         with self.start(str(SCRIPTS / script), *arguments, cwd=cwd, **env) as process:
-            wait_for(lambda: self._is_up(name, component, process), what=lambda: f"start of {process}")
+            self.wait_until_up(process, component.name, name)
             yield process
         self._forget(f"/{name}")
 
@@ -349,6 +349,11 @@ class Graph:
         import rosgraph
 
         return rosgraph.Master("/harness", master_uri=self.uri).getSystemState()
+
+    def wait_until_up(self, process: Process, kind: str, name: str = "") -> None:
+        """Wait until all services of a node of the component `kind` are registered; they are so one after the other."""
+        component = interface.COMPONENTS[kind]
+        wait_for(lambda: self._is_up(name or kind, component, process), what=lambda: f"start of {process}")
 
     def _is_up(self, name: str, component: interface.ComponentSpec, process: Process) -> bool:
         if not process.alive:

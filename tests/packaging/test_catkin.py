@@ -17,7 +17,7 @@ import pytest
 
 from rosafe import __version__
 from rosafe.ros1.component import generate
-from tests.harness import PYTHON, ROOT, Graph, MasterProcess, wait_for
+from tests.harness import PYTHON, ROOT, Graph, MasterProcess
 from tests.packaging.clone import definitions, environment, fresh_copy, keep_few_definitions, run
 
 NEEDED = ("catkin_make", "cmake", "make", "cc")
@@ -187,7 +187,7 @@ def test_both_nodes_run_from_the_install_space(
         graph.start("env", "-i", *plain, "sh", "-c", f"{setup} && exec rosAFE-ros") as rosafe,
     ):
         for name, node in (("bass", bass), ("rosAFE", rosafe)):
-            wait_for(lambda name=name: f"/{name}/Stop" in graph.services(), what=lambda node=node: str(node))  # type: ignore[misc]
+            graph.wait_until_up(node, name)
         called = printed(sourced(workspace, "rosservice call /bass/Acquire \"{device: 'scene:'}\"", **ros))
         assert "genom_success: True" in called
         published = printed(sourced(workspace, "rostopic echo -n1 /bass/Audio/sampleRate", **ros))

@@ -16,7 +16,7 @@ import pytest
 
 from rosafe.ros1.component import generate
 from rosafe.system.version import VERSION
-from tests.harness import PYTHON, ROOT, Graph, MasterProcess, wait_for
+from tests.harness import PYTHON, ROOT, Graph, MasterProcess
 from tests.packaging.clone import environment, fresh_copy, run
 
 NAMES = ("python3-rosafe", "rosafe")
@@ -162,7 +162,7 @@ def test_nodes_run_from_the_packages(root: Path, private_graph: tuple[Graph, Mas
         graph.start(*plain, str(root / "usr/lib/rosAFE/rosAFE-ros")) as rosafe,
     ):
         for name, node in (("bass", bass), ("rosAFE", rosafe)):
-            wait_for(lambda name=name: f"/{name}/Stop" in graph.services(), what=lambda node=node: str(node))  # type: ignore[misc]
+            graph.wait_until_up(node, name)
         exports = run(
             *(PYTHON, "-P", "-m", "rosafe.ros1.component.generate", "--shell"),
             env=environment(PYTHONPATH=str(root / "usr/lib/python3/dist-packages"), **ros),

@@ -92,7 +92,7 @@ def test_two_machines(net: Net, tmp_path: Path) -> None:
         master.start(graph.env)
         far = ["ip", "netns", "exec", net.name, str(SCRIPTS / "rosAFE-ros"), "-i", "far"]
         with graph.node("bass-ros"), graph.start(*far, ROS_IP=net.far) as process:
-            wait_for(lambda: "/far/kill" in graph.services() or not process.alive, what=lambda: str(process))
+            graph.wait_until_up(process, "rosAFE", "far")
             received = graph.run(PYTHON, "-c", CLIENT).stdout.split()
             assert received[0] == "received" and (int(received[1]) - 1) % 2205 == 0
             assert process.stop(signal.SIGTERM) == 0

@@ -79,7 +79,7 @@ def test_the_newer_of_two_inputs_remains_at_any_point_of_the_older(graph: Graph,
     program.write_text(STALLING)
     name = f"stalling_{where}"
     with graph.start(PYTHON, str(program), where, str(tmp_path), "-i", name, PYTHONPATH=python_path(graph)) as process:
-        wait_for(lambda: f"/{name}/Stop" in graph.services(), what=lambda: str(process))
+        graph.wait_until_up(process, "rosAFE", name)
         session = Session(graph, process, name)
         session.listen()
 

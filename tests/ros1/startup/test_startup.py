@@ -372,8 +372,7 @@ def test_rosnode_kill_ends_a_node(graph: Graph) -> None:
 
 def test_nohup_is_respected(graph: Graph) -> None:
     with graph.start("nohup", "bass-ros", "-i", "lasting") as node:
-        wait_for(lambda: "/lasting/kill" in graph.services(), what=lambda: str(node))
-        wait_for(lambda: ("/lasting/Acquire/cancel", "/lasting") in graph.readers())
+        graph.wait_until_up(node, "bass", "lasting")
         os.kill(node.pid, signal.SIGHUP)
         assert graph.call("/lasting/Acquire", device="scene:", sampleRate=20000).genom_success
         graph.message("/lasting/Audio", accept=lambda message: message.lastFrameIndex > 30000)  # it would have ended

@@ -189,7 +189,7 @@ sys.exit(node.main([]))
 def slow_bass(world: World, opened: Path) -> Iterator[harness.Process]:
     code = f"import sys; sys.path.insert(0, {str(harness.ROOT)!r}){SLOW_BASS}"
     with world.graph.start(harness.PYTHON, "-c", code, str(opened)) as process:
-        harness.wait_for(lambda: "/bass/Stop" in world.graph.services())
+        world.graph.wait_until_up(process, "bass")
         yield process
 
 
