@@ -351,7 +351,7 @@ class Graph:
         return rosgraph.Master("/harness", master_uri=self.uri).getSystemState()
 
     def wait_until_up(self, process: Process, kind: str, name: str = "") -> None:
-        """Wait until all services of a node of the component `kind` are registered; they are so one after the other."""
+        """Wait until a node of the component `kind` has registered all its services, one after the other."""
         component = interface.COMPONENTS[kind]
         wait_for(lambda: self._is_up(name or kind, component, process), what=lambda: f"start of {process}")
 

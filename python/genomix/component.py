@@ -107,7 +107,8 @@ def _service(client: Client, about: dict[str, Any], name: str, service: dict[str
 def _sent(send: Callable[[], Request], wait: Callable[[Request], object]) -> Request:
     """Send a request and wait; an exception, such as Ctrl-C, aborts the activity.
 
-    It is sent on a thread, which Ctrl-C does not interrupt: without the answer there is no number to abort.
+    Another thread sends the request, because Ctrl-C does not interrupt that thread, and only the answer contains the
+    number that `abort` needs.
     """
     sending: Future[Request] = Future()
 

@@ -61,7 +61,7 @@ async def action_of_bass() -> AsyncIterator[Action]:
 async def test_a_goal_is_sent_when_all_topics_are_connected(
     action: Action, /, monkeypatch: pytest.MonkeyPatch, missing: str
 ) -> None:
-    """A result and a cancellation are sent once: who is not connected yet would miss them."""
+    """A result and a cancellation are sent once: a client or component that is not connected yet would miss them."""
     monkeypatch.setattr(actions, "REPEAT_SECONDS", 0.01)
     for topic in (action.goal, action.cancel, action.result, action.status):
         topic.connections = 1
