@@ -26,8 +26,10 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+import xmlrpc.client
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, TypeVar
@@ -341,6 +343,15 @@ class Graph:
         """Return all subscriptions: (topic, node)."""
         return {(topic, node) for topic, nodes in self._state()[1] for node in nodes}
 
+    def wait_until_read(self, topics: Iterable[str], readers: Collection[str]) -> None:
+        """Wait until nodes that publish `topics` are connected to the nodes `readers`, some time after registration."""
+        master: Any = xmlrpc.client.ServerProxy(self.uri)
+        publishers = dict(self._state()[0])
+        for topic, node in ((name, node) for name in topics for node in publishers.get(name, ())):
+            address = master.lookupNode("/harness", node)[2]
+            if _is_served(address):
+                wait_for(partial(_is_read, address, topic, set(readers)), what=f"{node} sends {topic} to {readers}")
+
     def nodes(self) -> set[str]:
         """Return all nodes with a publisher, a subscriber or a service."""
         return {node for kind in self._state() for _, nodes in kind for node in nodes}
@@ -419,7 +430,7 @@ class Graph:
 
     @contextmanager
     def collect(self, topic: str, message_class: Any = None) -> Iterator[list[Any]]:
-        """Collect messages on `topic` in a list until the end of the ``with`` block."""
+        """Collect messages on `topic` in a list until the end of the ``with`` block; yield when they arrive."""
         import rospy
         import rostopic
 
@@ -429,6 +440,7 @@ class Graph:
         messages: list[Any] = []
         subscriber = rospy.Subscriber(topic, message_class, messages.append, buff_size=2**22, tcp_nodelay=True)
         try:
+            self.wait_until_read([topic], [rospy.get_name()])
             yield messages
         finally:
             subscriber.unregister()
@@ -441,6 +453,12 @@ class Graph:
             raise RuntimeError("rospy in this process belongs to the shared graph")
         if not rospy.core.is_initialized():
             rospy.init_node(f"test_{os.getpid()}", disable_signals=True)
+
+
+def _is_read(address: str, topic: str, readers: set[str]) -> bool:
+    """Return whether the node at `address` is connected to all `readers` of `topic`."""
+    node: Any = xmlrpc.client.ServerProxy(address)
+    return readers <= {entry[1] for entry in node.getBusInfo("/harness")[2] if (entry[2], entry[4]) == ("o", topic)}
 
 
 def _is_served(uri: str) -> bool:

@@ -64,6 +64,7 @@ def recorded(graph: Graph, bass: Process, tmp_path_factory: pytest.TempPathFacto
     ):
         prepare(node, "bass/Audio", *REQUESTS)
         wait_for(lambda: ("/bass/Audio", "/recorder") in graph.readers(), what=lambda: str(recorder))
+        graph.wait_until_read(["/bass/Audio"], ["/recorder"])
         acquire(graph, f"file:{folder / 'a.wav'}")
         assert_same(node, recorded)
         # As by `rosnode kill`; a signal would end rosbag before its child has closed the bag.
