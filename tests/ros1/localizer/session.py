@@ -114,8 +114,9 @@ def acquire(graph: Graph, device: str, chunk: int = 800, rate: int = 0) -> None:
 
 
 def wait_played(bass: Process, path: Path, sources: list[Any]) -> None:
-    """Wait for the end of a file, and until a second of messages on ~sources without a source has followed it."""
-    wait_for(lambda: f"file:{path}: end of the source" in bass.err, what=lambda: f"the end of {path}: {bass}")
+    """Wait for the end of the acquired file, and until a second of ~sources without a source has followed it."""
+    end = f"file:{path}: end of the source"
+    wait_for(lambda: end in bass.err.rpartition("acquiring from")[2], what=lambda: f"the end of {path}: {bass}")
     ended = len(sources)
     wait_for(
         lambda: len(sources) >= ended + 10 and not any(message.sources for message in sources[-10:]), what="silence"
