@@ -235,6 +235,7 @@ def test_an_activity_is_waited_for(g: genomix.Client, tmp_path: Path) -> None:
     harness.wait_for(lambda: ended == [request])
     assert request.status is genomix.Status.done and request.result == {}
     assert bass.Acquire("scene:", oneway=True) is None
+    harness.wait_for(lambda: bass.getAcquisition()["running"])  # later, it would run in the next test
 
 
 BLOCKING = """
