@@ -344,7 +344,7 @@ class Graph:
         return {(topic, node) for topic, nodes in self._state()[1] for node in nodes}
 
     def wait_until_read(self, topics: Iterable[str], readers: Collection[str]) -> None:
-        """Wait until nodes that publish `topics` are connected to the nodes `readers`, some time after registration."""
+        """Wait until the publishers of `topics` are connected to the nodes `readers`: later than their registration."""
         master: Any = xmlrpc.client.ServerProxy(self.uri)
         publishers = dict(self._state()[0])
         for topic, node in ((name, node) for name in topics for node in publishers.get(name, ())):
@@ -429,7 +429,7 @@ class Graph:
 
     @contextmanager
     def collect(self, topic: str, message_class: Any = None) -> Iterator[list[Any]]:
-        """Collect messages on `topic` in a list until the end of the ``with`` block; yield when they arrive."""
+        """Collect messages on `topic` until the end of the ``with`` block; yield when the publishers are connected."""
         import rospy
         import rostopic
 

@@ -1,4 +1,4 @@
-"""The harness: child processes have default signals, however the suite was started; forks behave as new processes."""
+"""The harness: children have default signals, however the suite was started; forks are as new processes; topics."""
 
 from __future__ import annotations
 
@@ -53,6 +53,15 @@ def test_suite_that_ignores_signals(workers: str, tmp_path: Path) -> None:
     command = f"trap '' HUP INT QUIT TERM USR1; exec {tests}"
     done = subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and "4 passed" in done.stdout, done.stdout
+
+
+def test_the_first_message_is_collected(graph: Graph) -> None:
+    graph.client()
+    publisher = rospy.Publisher("/of_the_test/first", Empty, queue_size=1)
+    with graph.collect("/of_the_test/first", Empty) as messages:
+        publisher.publish()
+        harness.wait_for(lambda: len(messages) == 1, what="the first message")
+    publisher.unregister()
 
 
 # --- forks ------------------------------------------------------------------------------------------------------

@@ -63,7 +63,6 @@ def recorded(graph: Graph, bass: Process, tmp_path_factory: pytest.TempPathFacto
         graph.start("rosbag", "record", "-O", str(recorded.bag), "/bass/Audio", "__name:=recorder") as recorder,
     ):
         prepare(node, "bass/Audio", *REQUESTS)
-        wait_for(lambda: ("/bass/Audio", "/recorder") in graph.readers(), what=lambda: str(recorder))
         graph.wait_until_read(["/bass/Audio"], ["/recorder"])
         acquire(graph, f"file:{folder / 'a.wav'}")
         assert_same(node, recorded)

