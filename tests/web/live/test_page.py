@@ -31,6 +31,12 @@ END = "JSON.parse(document.querySelector('canvas[data-kind=ild]').dataset.plot).
 CHOOSE = "[...document.querySelectorAll('.node .name')].find((one) => one.textContent.startsWith(arguments[0])).click()"
 
 
+def choose(shown: Browser, name: str) -> None:
+    """Select a processor; a second click would end the selection."""
+    if shown.run("return document.querySelector('#processor:not([hidden]) h2')?.textContent") != name:
+        shown.run(CHOOSE, name)
+
+
 def column_times(plot: dict[str, float], columns: int) -> np.ndarray:
     """Return the time of the audio (s) of each column of pixels."""
     return plot["from"] + (np.arange(columns) + 0.5) / columns * (plot["to"] - plot["from"])
@@ -200,7 +206,7 @@ def test_the_readout_has_units(shown: Browser) -> None:
 
 def test_a_parameter_is_changed_on_the_page(world: World, shown: Browser) -> None:
     shown.until("return document.querySelectorAll('.node .name').length > 4")
-    shown.run(CHOOSE, "ratemap_0")
+    choose(shown, "ratemap_0")
     write = (
         "const one = document.querySelector('[data-parameter=rm_decaySec]'); one.value = arguments[0];"
         "one.dispatchEvent(new Event('change'))"
@@ -213,7 +219,30 @@ def test_a_parameter_is_changed_on_the_page(world: World, shown: Browser) -> Non
     message = shown.until(error)
     assert "e_badNewValue" in message and "rm_decaySec" in message
     assert world.processors()["ratemap_0"]["rm_decaySec"] == "0.0125"
-    assert shown.run("return document.querySelector('[data-parameter=rm_decaySec]').value") == "0.0125"
+    shown.until("return document.querySelector('[data-parameter=rm_decaySec]').value === '0.0125'")
+
+
+def test_a_field_with_the_focus_shows_the_value_of_the_component(world: World, shown: Browser) -> None:
+    """Another client changes it; what the user has typed stays until it is rejected."""
+    shown.until("return document.querySelectorAll('.node .name').length > 4")
+    choose(shown, "ratemap_0")
+    field = "const one = document.querySelector('[data-parameter=rm_decaySec]');"
+    shown.until(f"{field} one?.focus(); return Boolean(one) && document.activeElement === one")
+
+    def modify(name: str, value: str) -> None:
+        values = {"nameProc": "ratemap_0", "nameParam": name, "newValue": value}
+        assert world.graph.call("/rosAFE/modifyParameter", **values).genom_success
+
+    modify("rm_decaySec", "0.016")
+    shown.until(f"{field} return one.value === '0.016'")
+    shown.run(f"{field} one.value = '-3'")
+    modify("rm_decaySec", "0.02")
+    modify("rm_scaling", "magnitude")
+    shown.until("return document.querySelector('[data-parameter=rm_scaling]').value === 'magnitude'")
+    assert shown.run(f"{field} return document.activeElement === one && one.value") == "-3"
+    shown.run(f"{field} one.dispatchEvent(new Event('change'))")
+    shown.until(f"{field} return one.value === '0.02'")
+    assert "e_badNewValue" in shown.run(f"{field} return one.closest('.field').querySelector('.error').textContent")
 
 
 def test_a_representation_is_added_and_removed(world: World, shown: Browser) -> None:
@@ -228,7 +257,7 @@ def test_a_representation_is_added_and_removed(world: World, shown: Browser) -> 
         "canvas?.scrollIntoView(); return Boolean(canvas?.dataset.plot)"
     )
     assert "onsetStrength_0" in world.processors()
-    shown.run(CHOOSE, "onsetStrength_0")
+    choose(shown, "onsetStrength_0")
     shown.press("#processor .more")
     shown.press("dialog .primary")
     wait_for(lambda: "onsetStrength_0" not in world.processors(), what="its removal")

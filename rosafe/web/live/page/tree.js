@@ -44,6 +44,7 @@ export class TreeView {
     const selected = processors.find((one) => one.name === this.selected);
     if (!selected) this.#select(null);
     else if (!this.details.contains(document.activeElement)) this.#select(selected);
+    else this.#updateFields(selected);
   }
 
   #row(one, level) {
@@ -138,21 +139,33 @@ export class TreeView {
     const input = control(parameter, value);
     input.id = `p-${one.name}-${name}`;
     input.dataset.parameter = name;
+    input.dataset.current = value; // of the component, as far as the page knows
     input.disabled = this.watch || fixed;
     const field = el("div", { class: "field" }, el("label", { for: input.id, text: name }, parameter.unit ? el("span", { class: "unit", text: ` ${parameter.unit}` }) : ""), input,
       el("p", { class: "help", text: help(parameter) + (fixed ? "; set when the input was created" : "") }), error);
     input.addEventListener("change", async () => {
+      const newValue = read(input);
       try {
-        await this.link.request("modify", { nameProc: one.name, nameParam: name, newValue: read(input) });
+        await this.link.request("modify", { nameProc: one.name, nameParam: name, newValue });
+        input.dataset.current = newValue;
         this.#showError(one, name, "");
         field.classList.add("done");
         setTimeout(() => field.classList.remove("done"), 1200);
       } catch (problem) {
         this.#showError(one, name, problem.message);
-        write(input, this.processors.find((each) => each.name === one.name)?.values[name] ?? value);
+        write(input, input.dataset.current);
       }
     });
     return field;
+  }
+
+  // New values while a field has the focus; text that the user has typed stays until it is accepted or rejected.
+  #updateFields(one) {
+    for (const input of this.details.querySelectorAll("[data-parameter]")) {
+      const edited = read(input) !== input.dataset.current;
+      input.dataset.current = one.values[input.dataset.parameter] ?? "";
+      if (!edited) write(input, input.dataset.current);
+    }
   }
 
   #showError(one, name, text) {
