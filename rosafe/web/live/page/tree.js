@@ -147,7 +147,7 @@ export class TreeView {
       const newValue = read(input);
       try {
         await this.link.request("modify", { nameProc: one.name, nameParam: name, newValue });
-        input.dataset.current = newValue;
+        update(input, newValue);
         this.#showError(one, name, "");
         field.classList.add("done");
         setTimeout(() => field.classList.remove("done"), 1200);
@@ -159,13 +159,9 @@ export class TreeView {
     return field;
   }
 
-  // New values while a field has the focus; text that the user has typed stays until it is accepted or rejected.
+  // Called instead of #select while a field has the focus, which a new field would not have.
   #updateFields(one) {
-    for (const input of this.details.querySelectorAll("[data-parameter]")) {
-      const edited = read(input) !== input.dataset.current;
-      input.dataset.current = one.values[input.dataset.parameter] ?? "";
-      if (!edited) write(input, input.dataset.current);
-    }
+    for (const input of this.details.querySelectorAll("[data-parameter]")) update(input, one.values[input.dataset.parameter] ?? "");
   }
 
   #showError(one, name, text) {
@@ -268,6 +264,13 @@ function read(input) {
 function write(input, value) {
   if (input.type === "checkbox") input.checked = value === "1";
   else input.value = value;
+}
+
+// Store a new value of the component, and show it unless the user has typed another one.
+function update(input, value) {
+  const edited = read(input) !== input.dataset.current;
+  input.dataset.current = value;
+  if (!edited) write(input, value);
 }
 
 function help(parameter) {
