@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import os
 import signal
 import subprocess
@@ -291,6 +292,16 @@ def test_existing_results_are_kept_unless_resume_is_given(tmp_path: Path) -> Non
     assert_results(tmp_path / "out", sounds)
 
 
+def is_locked(path: Path) -> bool:
+    """Return whether a process has locked the file, also a killed one that the kernel has not ended yet."""
+    with open(path, encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
 def test_killed_and_resumed(tmp_path: Path) -> None:
     """All results are complete whenever the command is killed, and in the end none is missing."""
     sounds = corpus(tmp_path / "corpus", 40)
@@ -300,6 +311,7 @@ def test_killed_and_resumed(tmp_path: Path) -> None:
             wait_for(lambda: len(list(out.rglob("*.npz"))) >= required, what=lambda: str(command))  # noqa: B023
             os.killpg(command.pid, signal.SIGKILL)
             command.wait()
+        wait_for(lambda: not any(map(is_locked, out.rglob("*.part"))), what="the end of all killed processes")
         for path in out.rglob("*.npz"):
             assert load(path)["ild"].shape == (3, 17)
     done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--resume", cwd=tmp_path)
