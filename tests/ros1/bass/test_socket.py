@@ -56,12 +56,17 @@ class Server:
 
     def __init__(self) -> None:
         self.content: Snapshot | None = port_content(100, 20)
+        self.reads = 0
         self.reports: list[str] = []
         self.stopping = threading.Event()
-        self._socket = DedicatedSocket(lambda: self.content, "127.0.0.1", 0, self.reports.append)
+        self._socket = DedicatedSocket(self._read, "127.0.0.1", 0, self.reports.append)
         self.address = self._socket.address
         self.thread = threading.Thread(target=self._socket.serve, args=(self.stopping,))
         self.thread.start()
+
+    def _read(self) -> Snapshot | None:
+        self.reads += 1
+        return self.content
 
     def clients(self) -> int:
         return sum(thread.name == "socket client" for thread in threading.enumerate())

@@ -11,7 +11,7 @@ import pytest
 
 from rosafe.ros1.bass import socket_client
 from rosafe.ros1.bass.socket_client import Received, SocketClient, blocks
-from tests.harness import PATIENCE
+from tests.harness import PATIENCE, wait_for
 from tests.ros1.bass.test_socket import Server, port_content, server
 
 __all__ = ["server"]
@@ -55,8 +55,15 @@ def test_starts_with_the_next_frame_and_stops_on_request(server: Server) -> None
     host, port = server.address
     stopping = threading.Event()
     stream = blocks(host, port, stopping=stopping)
-    threading.Timer(0.1, lambda: setattr(server, "content", port_content(103, 20))).start()
+
+    def capture() -> None:
+        wait_for(lambda: server.reads >= 2, what="the client, which first asks for the newest frame")
+        server.content = port_content(103, 20)
+
+    capturing = threading.Thread(target=capture)
+    capturing.start()
     assert numbers(next(stream)) == [101, 102, 103]
+    capturing.join(PATIENCE)
     stopping.set()
     assert next(stream, None) is None
     assert list(blocks(host, port, patience=0.05)) == []

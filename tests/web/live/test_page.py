@@ -256,18 +256,29 @@ def test_a_field_with_the_focus_shows_the_value_of_the_component(world: World, s
     assert "e_badNewValue" in shown.run(f"{field} return one.closest('.field').querySelector('.error').textContent")
 
 
-def test_a_representation_is_added_and_removed(world: World, shown: Browser) -> None:
+def add(shown: Browser, kind: str) -> None:
+    """Add a representation, and wait for its plot."""
     shown.press("#tree .more")
     shown.run(
-        "const kind = document.querySelector('dialog select'); kind.value = 'onsetStrength';"
-        "kind.dispatchEvent(new Event('change'));"
+        "const kind = document.querySelector('dialog select'); kind.value = arguments[0];"
+        "kind.dispatchEvent(new Event('change'));",
+        kind,
     )
     shown.press("dialog .primary")
     shown.until(  # only visible plots are drawn
-        "const canvas = document.querySelector('canvas[data-kind=onsetStrength]');"
-        "canvas?.scrollIntoView(); return Boolean(canvas?.dataset.plot)"
+        "const canvas = document.querySelector(`canvas[data-kind=${arguments[0]}]`);"
+        "canvas?.scrollIntoView(); return Boolean(canvas?.dataset.plot)",
+        kind,
     )
+
+
+def test_a_representation_is_added_and_removed(world: World, shown: Browser) -> None:
+    add(shown, "onsetStrength")
     assert "onsetStrength_0" in world.processors()
+    panel = "document.querySelector('canvas[data-kind=onsetStrength]').closest('.panel')"
+    shown.run(f"{panel}.querySelector('[aria-label=close]').click()")
+    add(shown, "onsetStrength")  # it exists, so that the page has its tree before the answer
+    assert "onsetStrength_1" not in world.processors()
     choose(shown, "onsetStrength_0")
     shown.press("#processor .more")
     shown.press("dialog .primary")

@@ -109,11 +109,6 @@ link.addEventListener("tree", ({ detail }) => {
   processors = detail.processors;
   plots.updateTree(processors, processors.length > 0 || (status && !status.problem));
   tree?.update(processors);
-  const built = processors.find((one) => one.name === tree?.openWhenBuilt);
-  if (built) {
-    tree.openWhenBuilt = null;
-    if (!plots.isOpen(built.name)) plots.toggle(built);
-  }
   showEmptyState();
 });
 

@@ -45,6 +45,15 @@ export class TreeView {
     if (!selected) this.#select(null);
     else if (!this.details.contains(document.activeElement)) this.#select(selected);
     else this.#updateFields(selected);
+    this.#openBuilt();
+  }
+
+  // The tree can be known before the answer to the request, or after it.
+  #openBuilt() {
+    const built = this.processors.find((one) => one.name === this.openWhenBuilt);
+    if (!built) return;
+    this.openWhenBuilt = null;
+    if (!this.plots.isOpen(built.name)) this.plots.toggle(built);
   }
 
   #row(one, level) {
@@ -234,6 +243,7 @@ export class TreeView {
         dialog.close();
         toast(answer.created.length ? `built ${answer.created.join(", ")}` : `${answer.name} exists already`);
         this.openWhenBuilt = answer.name;
+        this.#openBuilt();
       } catch (problem) {
         error.textContent = problem.message;
       }
