@@ -6,7 +6,7 @@ import threading
 import time
 from typing import Any
 
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
@@ -36,7 +36,7 @@ class TopicSource(ReceivedSource):
                 "run apt install ros-$ROS_DISTRO-audio-common-msgs"
             ) from None
         self._node = node
-        group = ReentrantCallbackGroup()  # messages arrive while a service waits for them
+        group = MutuallyExclusiveCallbackGroup()  # in their order, and also while a service waits for them
         publishers = self._find_publishers(stopping)
         stamped = any(one.topic_type == STAMPED for one in publishers)
         reliable = all(one.qos_profile.reliability == ReliabilityPolicy.RELIABLE for one in publishers)
