@@ -10,6 +10,7 @@ _IDL = read_idl(__file__)
 GENOM_EXCEPTIONS, GENOM_STATE = _IDL["exception"], _IDL["struct"]
 
 MAX_ACTIVITIES = 256  # per task, including its permanent one; deviation: the original has at most 32
+REJECTED_GOAL = "rejected"  # text of an accepted goal whose result, with the error, follows at once
 
 _PORT_NAMES = (
     Parameter.text("local", REQUIRED, "Name of this component's input port"),

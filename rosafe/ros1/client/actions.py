@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rosafe.interface import ComponentError
+from rosafe.interface.genom import REJECTED_GOAL
 from rosafe.ros1.client import installed_components
 from rosafe.ros1.client.errors import middleware_error
 from rosafe.ros1.client.graph import Graph
@@ -153,7 +154,7 @@ class ActionClient:
             if goal is None:
                 continue
             goal.seen.set()
-            if status.status in _ACTIVE:
+            if status.status in _ACTIVE and status.text != REJECTED_GOAL:
                 goal.warning = status.text
                 goal.acknowledged.set()
             elif status.status in _ENDED:

@@ -13,6 +13,7 @@ import rospy
 from actionlib_msgs.msg import GoalStatus, GoalStatusArray
 
 from rosafe.interface import ComponentError, Service
+from rosafe.interface.genom import REJECTED_GOAL
 from rosafe.ros1.component.activities import Activity, RequestDispatcher, too_many
 from rosafe.ros1.component.explicit_defaults import has_explicit_defaults
 from rosafe.ros1.transport.publisher import BufferList, Publisher
@@ -168,7 +169,7 @@ class GoalHandler:
         try:
             activity = self._dispatcher.start(service, goal.get_goal(), has_explicit_defaults(goal.goal), end)
         except ComponentError as problem:
-            goal.set_accepted()
+            goal.set_accepted(REJECTED_GOAL)
             self._set_succeeded(goal, problem)
             return
         self._running[goal.get_goal_id().id] = activity
@@ -205,4 +206,4 @@ def _accept_when_running(goal: Any, activity: Activity) -> None:
 def _set_accepted(goal: Any, activity: Activity) -> None:
     with goal.action_server.lock:
         if goal.get_goal_status().status in (GoalStatus.PENDING, GoalStatus.RECALLING):
-            goal.set_accepted(activity.warning)
+            goal.set_accepted(activity.warning if activity.error is None else REJECTED_GOAL)

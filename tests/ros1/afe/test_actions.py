@@ -14,6 +14,7 @@ from actionlib import CommState
 from actionlib_msgs.msg import GoalStatus
 
 from rosafe.interface import CORE_REPRESENTATIONS, ROSAFE
+from rosafe.interface.genom import REJECTED_GOAL
 from tests.harness import Graph, wait_for
 from tests.ros1.afe.session import Goal, Session, error_of, noise, own_node
 
@@ -66,7 +67,10 @@ def test_a_whole_tree_of_goals(afe: Session) -> None:
 
 def test_failures_are_results(afe: Session) -> None:
     build(afe, "PreProc")
-    assert failed(afe.goal("IhcProc")) == ("::rosAFE::e_noUpperDependencie", {})
+    with afe.graph.collect(f"/{afe.name}/IhcProc/status") as messages:
+        assert failed(afe.goal("IhcProc")) == ("::rosAFE::e_noUpperDependencie", {})
+        accepted = GoalStatus.ACTIVE, REJECTED_GOAL
+        wait_for(lambda: accepted in [(one.status, one.text) for message in messages for one in message.status_list])
     assert failed(afe.goal("PreProc")) == ("::rosAFE::e_existsAlready", {})
     ex, detail = failed(afe.goal("GammatoneProc", fb_nERBs=-1.0))
     assert ex == "::rosAFE::e_badNewValue" and "fb_nERBs" in detail["what"]

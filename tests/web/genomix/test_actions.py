@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from rosafe.interface import ComponentError
+from rosafe.interface.genom import REJECTED_GOAL
 from rosafe.ros1.client import actions
 from rosafe.ros1.client.actions import ActionClient
 from rosafe.ros1.client.graph import Graph
@@ -39,11 +40,11 @@ class Action:
         client._publishers.update(goal=topics[0], cancel=topics[1])
         client._subscribers += topics[2:]
 
-    def accept(self) -> None:
-        """Publish the status that an action server publishes for a running goal."""
+    def accept(self, text: str = "") -> None:
+        """Publish the status that an action server publishes for a goal that it has accepted."""
         from actionlib_msgs.msg import GoalStatus, GoalStatusArray
 
-        status = GoalStatus(status=GoalStatus.ACTIVE)
+        status = GoalStatus(status=GoalStatus.ACTIVE, text=text)
         status.goal_id.id = self.goal.sent[-1].goal_id.id
         self.client._on_status(GoalStatusArray(status_list=[status]))
 
@@ -89,3 +90,19 @@ async def test_a_goal_without_an_answer_is_cancelled(action: Action, /, monkeypa
         await action.client.send({"device": "scene:"})
     assert action.cancel.sent[0].id == action.goal.sent[0].goal_id.id
     assert action.client.goals == {}
+
+
+@in_loop(action_of_bass)
+async def test_a_goal_that_is_accepted_and_rejected_at_once(action: Action, /) -> None:
+    """It counts as acknowledged when its error arrives, however late: a client does not see it as running before."""
+    for topic in (action.goal, action.cancel, action.result, action.status):
+        topic.connections = 1
+    sending = asyncio.create_task(action.client.send({"device": "scene:"}))
+    async with asyncio.timeout(60):
+        while not action.goal.sent:
+            await asyncio.sleep(0.01)
+        action.accept(REJECTED_GOAL)
+        goal = await sending
+    assert not goal.acknowledged.is_set() and not goal.ended.is_set()
+    goal.end(ComponentError("::bass::e_device"))
+    assert goal.acknowledged.is_set() and goal.error is not None
