@@ -30,7 +30,7 @@ from rosafe.web.server.listener import HttpListener, connection_of
 MAX_WAIT_MS = 3_600_000
 FORMATTERS = 4  # threads
 BATCH = 128 * 1024  # characters written at a time
-REFUSAL_SECONDS = 0.05  # from the acknowledgement of a request that a component of others rejects to its error
+REFUSAL_SECONDS = 0.05  # from the acknowledgement to the error of a request that a component of another project rejects
 ANSWER_SECONDS = 75.0  # for any answer except /request/wait; a component has 60 s of these
 HEARTBEAT_SECONDS = 15.0  # between two lines to an event listener
 READ_SECONDS = 1.0  # between two reads of the parameter ~names, regardless of the number of requests
