@@ -105,6 +105,16 @@ def test_wrong_arguments(arguments: list[str]) -> None:
     assert done.stderr.startswith("usage: scripts/make-deb [FOLDER]")
 
 
+def test_build_without_pip_names_it(tmp_path: Path) -> None:
+    """Its error was that of an absent network."""
+    (tmp_path / "pip.py").write_text("raise ModuleNotFoundError\n", "utf-8")
+    done = run(ROOT / "scripts" / "make-deb", tmp_path / "packages", env=environment(PYTHONPATH=str(tmp_path)))
+    if "command not found" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 1
+    assert done.stderr == "scripts/make-deb: pip is not installed; run scripts/install --tests\n"
+
+
 def test_advice_about_missing_packages_names_those_of_debian(monkeypatch: pytest.MonkeyPatch) -> None:
     """`apt install rosafe` would fail: Debian does not have that package."""
     assert missing.install("matplotlib") == missing.install("rospy") == "run scripts/install"
