@@ -9,7 +9,6 @@ subscriber that reads slowly or not at all misses old messages and does not dela
 from __future__ import annotations
 
 import os
-import select
 import socket
 import struct
 import threading
@@ -97,21 +96,12 @@ class NewestMessage(NamedTuple):
 class _Topic(topics._PublisherImpl):
     """The implementation of a topic that rospy uses for a Publisher, with a `_Sender` for each connection."""
 
-    connection_poll: topics.Poller
-
     def __init__(self, name: str, data_class: Any) -> None:
         super().__init__(name, data_class)
         self.on_change: Callable[[], None] = lambda: None  # called when a subscriber has connected or disconnected
-        self.connection_poll.poller.close()
-        self.connection_poll = _Poller()
 
     def set_queue_size(self, queue_size: int) -> None:
         """Do not create rospy's queue and its thread: each sender has its own."""
-
-    def close(self) -> None:
-        """Close the topic and free its latched message: the closed topic is part of a reference cycle in rospy."""
-        super().close()
-        self.latch = None
 
     def add_connection(self, connection: Any) -> bool:
         """Add a subscriber and send it the latched message."""
@@ -165,21 +155,6 @@ class _Topic(topics._PublisherImpl):
             sender.offer(written)
 
 
-class _Poller(topics.Poller):
-    """Detects connections that have ended. Its file descriptor is closed with the topic.
-
-    rospy's poller is part of a reference cycle, so that descriptors of closed topics remain open until garbage
-    collection.
-    """
-
-    def __init__(self) -> None:
-        self.poller = select.epoll()
-
-    add_fd = topics.Poller.add_epoll
-    remove_fd = topics.Poller.remove_epoll
-    error_iter = topics.Poller.error_epoll_iter
-
-
 class _Sender:
     """The connection to one subscriber, and the thread that sends to it."""
 
@@ -201,6 +176,7 @@ class _Sender:
             try:
                 callback(self)
             finally:
+                self._connection.set_cleanup_callback(None)  # a reference cycle, also with the topic
                 self._wake()
 
         self._connection.set_cleanup_callback(closed)

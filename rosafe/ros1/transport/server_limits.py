@@ -9,6 +9,7 @@ replaces the following, before `rospy.init_node`; rospy itself is modified nowhe
 
 * ``rosgraph.xmlrpc.ThreadingXMLRPCServer``: a `HandshakeServer` reads requests, and only complete ones are parsed.
 * ``rospy.impl.tcpros_base.TCPServer``: a `HandshakeServer` reads headers. rospy handles topics, this module services.
+* ``rospy.topics.Poller``: descriptors of topics that have ended are closed at once, by `TopicPoller`.
 * the functions that `received_data` replaces: they read the data of publishers.
 """
 
@@ -17,6 +18,7 @@ from __future__ import annotations
 import functools
 import io
 import re
+import select
 import socket
 import struct
 import sys
@@ -27,6 +29,7 @@ from typing import Any
 
 import rosgraph.xmlrpc
 import rospy
+import rospy.topics
 from rosgraph.network import decode_ros_handshake_header, write_ros_handshake_header
 from rospy.impl import tcpros_base, tcpros_service
 from rospy.impl.registration import get_service_manager
@@ -49,11 +52,27 @@ _LONG = threading.BoundedSemaphore(LONG_REQUESTS)
 
 
 def install() -> None:
-    """Replace rospy's servers by those of this module, and raise the limit of descriptors."""
+    """Replace rospy's servers and poller by those of this module, and raise the limit of descriptors."""
     handshake_server.raise_limit()
     rosgraph.xmlrpc.ThreadingXMLRPCServer = XmlRpcServer
     tcpros_base.TCPServer = TcprosServer
+    rospy.topics.Poller = TopicPoller
     received_data.install()
+
+
+class TopicPoller(rospy.topics.Poller):
+    """Detects connections of a topic that have ended. Its descriptor is closed with the topic.
+
+    rospy's poller holds its own methods, so that descriptors of closed topics and of ended subscriptions remain open
+    until garbage collection.
+    """
+
+    def __init__(self) -> None:
+        self.poller = select.epoll()
+
+    add_fd = rospy.topics.Poller.add_epoll
+    remove_fd = rospy.topics.Poller.remove_epoll
+    error_iter = rospy.topics.Poller.error_epoll_iter
 
 
 # --- TCPROS: incoming connections -------------------------------------------------------------------------------

@@ -1,8 +1,11 @@
-"""The settings of the C library's allocator are accepted, and a process releases unused memory."""
+"""The settings of the C library's allocator are accepted, and a process releases unused memory and files."""
 
 from __future__ import annotations
 
 from pathlib import Path
+
+import rospy
+from std_msgs.msg import String
 
 from tests.harness import PYTHON, ROOT, Graph, proc
 from tests.plugins.stages import PLAIN, Fault, text_of
@@ -26,6 +29,33 @@ threads = [threading.Thread(target=work, args=(seed,)) for seed in range(12)]
 [thread.join() for thread in threads]
 malloc_tuning.trim()
 print(resident() - before)
+"""
+
+# Opens and ends topics. Each has an epoll object while it exists.
+TOPICS = """
+import gc, os, queue, rospy
+from rosafe.ros1.transport import registration
+from rosafe.ros1.transport.publisher import Publisher
+from std_msgs.msg import String
+from tests.harness import wait_for
+
+def polls():
+    files = (os.path.realpath(f"/proc/self/fd/{number}") for number in os.listdir("/proc/self/fd"))
+    return sum(file.endswith("[eventpoll]") for file in files)
+
+gc.disable()
+registration.init_node("opener", ["opener"])
+before = polls()
+for _ in range(6):
+    received = queue.Queue()
+    mine = Publisher("/of_the_opener", String)
+    theirs = [rospy.Subscriber(name, String, received.put) for name in ("/of_the_test/text", "/of_the_opener")]
+    mine.publish(String("mine"))
+    print(sorted(received.get(timeout=60).data for _ in theirs), polls() >= before + 3)
+    for topic in (mine, *theirs):
+        topic.unregister()
+del mine, theirs, topic
+wait_for(lambda: polls() == before, what=lambda: f"{polls()} epoll objects, {before} before")
 """
 
 
@@ -57,3 +87,13 @@ def test_removed_processors_are_freed_without_garbage_collection(graph: Graph, t
         after = ResourceUse.of(process.pid).memory
         session.close()
         assert (after - before) / 2**20 < 150, "of some 400 MiB"
+
+
+def test_files_of_topics_that_have_ended_are_closed_without_garbage_collection(graph: Graph) -> None:
+    proc()
+    graph.client()
+    text = rospy.Publisher("/of_the_test/text", String, latch=True, queue_size=1)
+    text.publish(String("theirs"))
+    done = graph.run(PYTHON, "-c", TOPICS, PYTHONPATH=str(ROOT))
+    assert done.stdout.splitlines() == ["['mine', 'theirs'] True"] * 6, done
+    text.unregister()
