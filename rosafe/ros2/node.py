@@ -53,6 +53,7 @@ from rosafe.ros2.outputs import Outputs, topics_of
 from rosafe.ros2.parameters import ProcessorParameters
 from rosafe.ros2.sound import SeparatedSound, Sound
 from rosafe.ros2.sound_topic import open_device
+from rosafe.system import malloc_tuning
 from rosafe.system.input import read_regular
 from rosafe.system.log_throttle import ThrottledLog
 from rosafe.system.terminal import printable
@@ -63,6 +64,7 @@ from rosafe.tree.tree_planner import kind_of
 TOPICS = ("sources", "posterior", "poses", "streams", "scene_truth")
 WORLD = "world"  # the coordinate frame of a scene, if none is set
 DIAGNOSTICS_SECONDS = 1.0
+TRIM_SECONDS = 20.0  # between two times that freed memory is returned to the system
 THREADS = 2  # of ROS: one may wait for a device whose sound another one receives
 SIGNAL_SECONDS = 0.2  # between two looks whether a signal has come
 END_SECONDS = 1.0  # that the threads of ROS may take at the end
@@ -128,6 +130,7 @@ class RosafeNode:
         self._serve()
         self._diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self.node.create_timer(DIAGNOSTICS_SECONDS, self._diagnose)
+        self.node.create_timer(TRIM_SECONDS, malloc_tuning.trim)
 
     def now(self) -> float:
         """Return the clock time in s; with `use_sim_time` that of /clock."""
@@ -392,6 +395,7 @@ def quoted(arguments: Sequence[str]) -> list[str]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM, and return its exit code: 1 if it cannot start."""
     arguments = quoted(sys.argv if argv is None else argv)
+    malloc_tuning.limit_arenas()
     with _signals() as received:
         try:
             rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from rosafe.ros1.transport.paths import PYPI_DIR
-from tests.harness import PATIENCE, ROOT, wait_for
+from tests.harness import PATIENCE, ROOT, proc, wait_for
 
 from .client import Client, joined, seconds
 from .network import Network
@@ -38,6 +38,21 @@ def test_two_nodes_side_by_side_with_other_names(ros2: Network, tmp_path: Path) 
     assert ild["topics"] == ["/levels"]
     assert first.call("stop")["success"]
     second.take("ild", 5)
+
+
+HEAP = 64 * 2**20  # bytes to which glibc aligns each further pool of the allocator
+
+
+def test_threads_share_two_pools_of_the_allocator(ros2: Network, tmp_path: Path, sphere_model: Path) -> None:
+    """With one for each of its threads the node had 300 MB more."""
+    node = ros2.node("device:=scene:", f"head:={sphere_model}", "localize:=true")
+    client = Client(ros2, tmp_path)
+    client.subscribe("sources", "rosafe_msgs/msg/SoundSources")
+    client.take("sources", 20)
+    regions = [line.split() for line in proc(node.pid, "maps").read_text().splitlines()]
+    own = [addresses for addresses, mode, *rest in regions if mode == "rw-p" and len(rest) == 3]  # of no file
+    pools = [addresses for addresses in own if int(addresses.partition("-")[0], 16) % HEAP == 0]
+    assert len(pools) < 4, pools  # one can consist of several parts
 
 
 def test_a_device_alone_is_localized_in_the_world(ros2: Network, tmp_path: Path, sphere_model: Path) -> None:

@@ -20,8 +20,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from rosafe.declarations.errors import ComponentError
-from rosafe.ros1.component import generate, malloc_tuning
+from rosafe.ros1.component import generate
 from rosafe.ros1.transport import master, paths, systemd
+from rosafe.system import malloc_tuning
 from rosafe.system.terminal import printable
 from rosafe.system.version import VERSION
 

@@ -16,9 +16,9 @@ import diagnostic_updater
 import rospy
 
 from rosafe import interface
-from rosafe.ros1.component import malloc_tuning
 from rosafe.ros1.component.activities import Activities
 from rosafe.ros1.transport import systemd
+from rosafe.system import malloc_tuning
 from rosafe.system.version import VERSION
 from rosafe.tree.health import TaskStatistics
 

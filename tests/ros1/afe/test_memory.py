@@ -15,7 +15,7 @@ from tests.soak.world import ResourceUse
 # Allocates memory of all sizes in many threads, frees almost all, and prints the resident MiB.
 SPREAD = """
 import random, threading
-from rosafe.ros1.component import malloc_tuning
+from rosafe.system import malloc_tuning
 malloc_tuning.limit_arenas()
 def resident():
     return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) // 1024
