@@ -55,6 +55,24 @@ def test_threads_share_two_pools_of_the_allocator(ros2: Network, tmp_path: Path,
     assert len(pools) < 4, pools  # one can consist of several parts
 
 
+def test_memory_of_removed_processors_is_returned(ros2: Network, tmp_path: Path) -> None:
+    def resident() -> float:
+        return int(proc(node.pid, "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+    node = ros2.node("device:=scene:?seconds=600", "representations:=[ild]", "frames_per_block:=12000")
+    client = Client(ros2, tmp_path)
+    client.subscribe("ild")
+    client.take("ild", 20)
+    before = resident()
+    for _ in range(4):
+        assert client.call("remove_processor", name="gammatone")["success"]
+        assert client.call("request", representation="ild", parameters="fb_nChannels: 128")["success"]
+        client.take("ild", 5)
+    assert resident() > before + 100
+    assert client.call("remove_processor", name="gammatone")["success"]
+    wait_for(lambda: resident() < before + 20, what=lambda: f"{resident():.0f} MiB, {before:.0f} before")
+
+
 def test_a_device_alone_is_localized_in_the_world(ros2: Network, tmp_path: Path, sphere_model: Path) -> None:
     node = ros2.node(
         "device:=scene:?seconds=600",

@@ -5,7 +5,7 @@ address: XML-RPC (the slave API, called by the master and by subscribers) and TC
 clients).
 
 rospy reads openings in its accept loops, accepts every length, and ends the loops if descriptors run out. `install`
-replaces the following, before `rospy.init_node`; rospy itself is modified nowhere else:
+replaces the following, before `rospy.init_node`:
 
 * ``rosgraph.xmlrpc.ThreadingXMLRPCServer``: a `HandshakeServer` reads requests, and only complete ones are parsed.
 * ``rospy.impl.tcpros_base.TCPServer``: a `HandshakeServer` reads headers. rospy handles topics, this module services.
