@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.system import malloc_tuning
 
 MIN_BYTES, MAX_BYTES = 2**24, 2**28  # of a buffer in the pool
 MAX_IDLE_PER_SIZE = 2  # idle buffers of each size
@@ -32,6 +33,12 @@ def empty(shape: tuple[int, ...]) -> FloatArray:
     except (KeyError, IndexError):
         memory = np.empty(count)
     return np.asarray(_PooledArray(memory, shape))
+
+
+def trim() -> None:
+    """Return the idle buffers, and the free memory of the C library, to the system."""
+    _idle.clear()
+    malloc_tuning.trim()
 
 
 class _PooledArray:

@@ -39,7 +39,7 @@ from rosafe_msgs.srv import (
 from std_srvs.srv import Trigger
 
 from rosafe.declarations.text import did_you_mean, join_names
-from rosafe.dsp import kernels
+from rosafe.dsp import buffer_pool, kernels
 from rosafe.interface import BASS, BLOCK_AND_BUFFERS, ComponentError, format_value
 from rosafe.localization.live import ERROR, OK, WARN
 from rosafe.localization.rotations import RotationBuffer
@@ -130,7 +130,7 @@ class RosafeNode:
         self._serve()
         self._diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self.node.create_timer(DIAGNOSTICS_SECONDS, self._diagnose)
-        self.node.create_timer(TRIM_SECONDS, malloc_tuning.trim)
+        self.node.create_timer(TRIM_SECONDS, buffer_pool.trim)
 
     def now(self) -> float:
         """Return the clock time in s; with `use_sim_time` that of /clock."""

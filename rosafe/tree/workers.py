@@ -273,6 +273,7 @@ class Workers:
             self._woken -= 1
             while (task := self._wait_for_task(me)) is not None:
                 self._work(task)
+                del task  # a waiting thread would keep it: a processor, which may be removed
             self._workers.remove(me)
             del self._threads[name]
 
@@ -283,6 +284,7 @@ class Workers:
                 while self._ready:
                     task = self._pop_task(me) if len(self._workers) > 1 else heapq.heappop(self._ready)[2]
                     if not task.begin_work():
+                        del task  # see `_run`
                         continue
                     me.task = task
                     if not me.has_slot:

@@ -55,6 +55,15 @@ def test_few_buffers_are_kept() -> None:
     assert len(buffer_pool._idle) == buffer_pool.MAX_SIZES
 
 
+def test_trim_frees_idle_buffers() -> None:
+    used = buffer_pool.empty((*ROWS, LONG))
+    used[:] = 1.0
+    buffer_pool.empty((*ROWS, LONG))
+    assert len(buffer_pool._idle) == 1
+    buffer_pool.trim()
+    assert not buffer_pool._idle and (used == 1.0).all()
+
+
 def test_many_threads() -> None:
     def work(seed: int) -> None:
         for round_ in range(30):

@@ -6,6 +6,7 @@ import math
 import os
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from typing import Any
 
@@ -206,6 +207,26 @@ def test_the_calling_thread_runs_only_short_tasks_of_this_package(tasks: list[Re
     wait_for(lambda: all(task.threads for task in tasks))
     names = [task.threads for task in tasks]
     assert names == [["MainThread"]] * own + [["rosafe worker 1"]] * (len(tasks) - own)
+    with lock:
+        workers.remove_client(client)
+    workers.join()
+
+
+@pytest.mark.parametrize("begins", [True, False])
+def test_idle_workers_keep_no_task(begins: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is a processor that may have been removed, with tens of MB."""
+    lock = threading.RLock()
+    workers = pool.Workers(lock, 1)
+    monkeypatch.setattr(RecordedTask, "begin_work", lambda task: task.threads.append("begin") or begins)
+    task = RecordedTask(1e-4)
+    client, pushed, threads = EstimatedTask(0.0), weakref.ref(task), task.threads
+    with lock:
+        workers.add_client(client)
+        workers.push(task)
+        workers.wake()
+    del task
+    wait_for(lambda: pushed() is None)
+    assert threads == ["begin"] + ["rosafe worker 1"] * begins
     with lock:
         workers.remove_client(client)
     workers.join()

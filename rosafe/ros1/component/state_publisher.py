@@ -16,9 +16,9 @@ import diagnostic_updater
 import rospy
 
 from rosafe import interface
+from rosafe.dsp import buffer_pool
 from rosafe.ros1.component.activities import Activities
 from rosafe.ros1.transport import systemd
-from rosafe.system import malloc_tuning
 from rosafe.system.version import VERSION
 from rosafe.tree.health import TaskStatistics
 
@@ -125,4 +125,4 @@ class Diagnostics(diagnostic_updater.Updater):
             systemd.notify("WATCHDOG=1")
             self.force_update()  # `update` asks the master for the period, and fails without a master
             if next(rounds) % TRIM_ROUNDS == 0:
-                malloc_tuning.trim()
+                buffer_pool.trim()
