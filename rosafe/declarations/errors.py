@@ -48,3 +48,13 @@ class ComponentError(Exception):
         text = json.dumps(self.body, separators=(",", ":"), ensure_ascii=False)
         # An unpaired surrogate cannot be encoded in UTF-8; as an escape it is valid JSON.
         return text.encode("utf-8", "backslashreplace").decode()
+
+
+def forget_frames(error: BaseException) -> None:
+    """Drop the tracebacks of an error that is kept, and of its causes: their frames refer to many objects, or to it."""
+    seen, waiting = set(), [error]
+    while waiting:
+        one = waiting.pop()
+        one.__traceback__ = None
+        seen.add(id(one))
+        waiting += [other for other in (one.__cause__, one.__context__) if other is not None and id(other) not in seen]

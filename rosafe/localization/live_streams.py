@@ -127,8 +127,7 @@ class LiveStreams:
                 self._ended.wait(_WAIT)
                 continue
             try:
-                with contextlib.closing(opened[1]()) as sound:
-                    self._separate(SourceStreams(opened[0], self._detects), sound, opened)
+                self._use(opened)
             except ValueError as problem:  # of the model
                 self._status.set("streams", WARN, f"no streams of sources: {problem}")
                 self._ended.wait(_PAUSE)
@@ -136,6 +135,11 @@ class LiveStreams:
                 self._status.set_error("streams", problem)
                 self._ended.wait(_PAUSE)
             self._speech = {}
+
+    def _use(self, opened: Any) -> None:
+        model, open_sound = opened
+        with contextlib.closing(open_sound()) as sound:
+            self._separate(SourceStreams(model, self._detects), sound, opened)
 
     def _separate(self, streams: SourceStreams, sound: LiveSound, opened: Any) -> None:
         """Publish the parts of all sources while there are subscribers."""

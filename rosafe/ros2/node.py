@@ -21,6 +21,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy._rclpy_pybind11 import RCLError
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -129,8 +130,9 @@ class RosafeNode:
         self._keep = self._kept()
         self._serve()
         self._diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
-        self.node.create_timer(DIAGNOSTICS_SECONDS, self._diagnose)
-        self.node.create_timer(TRIM_SECONDS, buffer_pool.trim)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # that of a simulation may stand still
+        self.node.create_timer(DIAGNOSTICS_SECONDS, self._diagnose, clock=steady)
+        self.node.create_timer(TRIM_SECONDS, buffer_pool.trim, clock=steady)
 
     def now(self) -> float:
         """Return the clock time in s; with `use_sim_time` that of /clock."""

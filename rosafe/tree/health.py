@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from rosafe.declarations.errors import forget_frames
 from rosafe.dsp.plugin_checks import plugin_of
 from rosafe.system.log_throttle import ThrottledLog
 from rosafe.tree.processor import Processor
@@ -185,6 +186,7 @@ class ProcessorHealth:
             failure = next((f for f in self._tree.failures if f.name == processor.name), Failure.of(processor))
             trace = "".join(traceback.format_exception(processor.error.__cause__ or processor.error))
             self._error(f"{failure}; {NEXT_STEP}\n{trace}")
+            forget_frames(processor.error)
 
     def report(self, status: Any) -> Any:
         """Fill in a status of /diagnostics."""

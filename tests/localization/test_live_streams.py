@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -134,6 +135,9 @@ def test_sound_is_read_for_subscribers_only(session: Session, sphere_model: Path
     wait_for(lambda: len(opened) == 2, what="another subscription")
     session.streams.connect(None)
     wait_for(opened[1].closed.is_set, what="the end of the sound")
+    sounds = [weakref.ref(sound) for sound in opened]
+    opened.clear()
+    wait_for(lambda: [sound() for sound in sounds] == [None] * 2, what="none is kept")
 
 
 def test_the_first_times_are_those_of_another_stream(session: Session, sphere_model: Path, ears: np.ndarray) -> None:

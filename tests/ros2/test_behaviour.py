@@ -71,11 +71,14 @@ def test_threads_share_two_pools_of_the_allocator(ros2: Network, tmp_path: Path,
 
 
 def test_memory_of_removed_processors_is_returned(ros2: Network, tmp_path: Path) -> None:
+    """Also while the clock of a simulation stands still."""
+    given = ("device:=scene:?seconds=600", "representations:=[ild]", "frames_per_block:=12000")
+    node = ros2.node(*given, "use_sim_time:=true")
+    client = Client(ros2, tmp_path)
+
     def resident() -> float:
         return int(proc(node.pid, "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
-    node = ros2.node("device:=scene:?seconds=600", "representations:=[ild]", "frames_per_block:=12000")
-    client = Client(ros2, tmp_path)
     client.subscribe("ild")
     client.take("ild", 20)
     before = resident()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from rosafe.interface import ComponentError
+from rosafe.tree.health import ProcessorHealth
 from rosafe.tree.processor import Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
@@ -107,6 +108,42 @@ def test_removed_processors_are_freed_without_garbage_collection(feed: Feed, mon
         assert [one() for one in objects if one() is not None] == []
     finally:
         gc.enable()
+
+
+def test_failed_processors_are_freed_without_garbage_collection(feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their errors are kept; frames of their tracebacks refer to them, their blocks and their parents."""
+
+    class Faulty(Plain):
+        def compute(self, block: np.ndarray) -> np.ndarray:
+            try:
+                raise ValueError("the cause")
+            except ValueError as problem:
+                raise problem from problem
+
+    use_plain_stages(monkeypatch, ihc=Faulty)
+    listener = Recorder()
+    lines: list[str] = []
+    tree = Tree(listener, 1)
+    health = ProcessorHealth(tree, lines.append, lines.append)
+    monkeypatch.setattr(listener, "on_removed", health.ended)
+    gc.disable()
+    try:
+        tree.add_input("input", feed, 1, 1.0, 1.0)
+        for name, kind, parent in (("pre", "preProc", "input"), ("bank", "gammatone", "pre"), ("cells", "ihc", "bank")):
+            tree.add(kind, name, parent)
+        failed = weakref.ref(tree.find("cells"))
+        parents = [weakref.ref(tree.find(name)) for name in ("pre", "bank")]
+        feed.put(count=1)
+        wait_for(lambda: "cells" not in [one.name for one in tree.processors])
+        tree.remove("pre")
+        listener.processors.clear()
+        listener.blocks.clear()
+        wait_for(lambda: [one() for one in (failed, *parents)] == [None] * 3)
+    finally:
+        gc.enable()
+        tree.stop()
+        tree.join()
+    assert len(lines) == 1 and "in compute" in lines[0] and "ValueError: the cause" in lines[0]
 
 
 def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:

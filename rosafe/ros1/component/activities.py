@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
+from rosafe.declarations.errors import forget_frames
 from rosafe.declarations.text import join_names
 from rosafe.interface import MAX_ACTIVITIES, ComponentError, ComponentSpec, Service
 
@@ -165,6 +166,8 @@ class Activities:
             error = unexpected_error(problem)
         with self._lock:
             del self._live[activity.id]
+        if error is not None:
+            forget_frames(error)
         activity.error = error
         activity.begun.set()
         try:

@@ -180,6 +180,8 @@ class _Sender:
                 self._wake()
 
         self._connection.set_cleanup_callback(closed)
+        if self._connection.done:  # by a message to a subscriber that has left, while rospy adds it
+            closed(self._connection)
 
     def end(self) -> None:
         """Close the connection, whether or not it is registered in rospy."""

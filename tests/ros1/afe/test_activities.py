@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import threading
+import weakref
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +15,7 @@ from rosafe.interface import BASS, MAX_ACTIVITIES, ROSAFE, ComponentError
 from rosafe.ros1.component.activities import Activities, Activity
 from rosafe.tree import health
 from rosafe.tree.health import TaskStatistics
-from tests.harness import PATIENCE
+from tests.harness import PATIENCE, wait_for
 
 INPUT = ROSAFE.service("InputProc")  # interrupts its own kind
 IHC = ROSAFE.service("IhcProc")
@@ -107,6 +109,27 @@ def test_failures_are_named_errors(board: Board, problem: BaseException, exdetai
     assert activity.error is not None and activity.error.exdetail == exdetail
     assert len(board.crashes) == crashes
     assert board.activities.live() == []
+
+
+def test_an_error_keeps_nothing_of_its_handler(board: Board) -> None:
+    """Such as a processor that has failed."""
+    objects: list[weakref.ref[Any]] = []
+
+    def handler(activity: Activity, values: dict[str, Any]) -> None:
+        local = threading.Event()
+        objects.append(weakref.ref(local))
+        try:
+            raise KeyError("the context")
+        except KeyError:
+            raise ROSAFE.error("e_noData") from None
+
+    gc.disable()
+    try:
+        activity = board.start(handler=handler)
+        assert activity.ended.wait(PATIENCE) and activity.error is not None
+        wait_for(lambda: objects[0]() is None)
+    finally:
+        gc.enable()
 
 
 def test_lack_of_threads_is_a_named_error(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:

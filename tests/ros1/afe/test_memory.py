@@ -33,7 +33,7 @@ print(resident() - before)
 
 # Opens and ends topics. Each has an epoll object while it exists.
 TOPICS = """
-import gc, os, queue, rospy
+import gc, os, queue, rospy, threading
 from rosafe.ros1.transport import registration
 from rosafe.ros1.transport.publisher import Publisher
 from std_msgs.msg import String
@@ -45,6 +45,10 @@ def polls():
 
 gc.disable()
 registration.init_node("opener", ["opener"])
+heard = threading.Event()
+kept = Publisher("/of_the_opener/kept", String), rospy.Subscriber("/of_the_opener/kept", String, lambda _: heard.set())
+kept[0].publish(String("kept"))
+assert heard.wait(60)  # the servers of the node run, which have epoll objects, too
 before = polls()
 for _ in range(6):
     received = queue.Queue()

@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import socket
+import struct
 import threading
 import xmlrpc.client
 from collections.abc import Iterator
@@ -243,6 +244,30 @@ def test_a_disconnected_subscriber_is_removed(graph: Graph) -> None:
     wait_for(lambda: (port.publish(message(1)), port.get_num_connections() == 0)[1])
     wait_for(lambda: not [t for t in threading.enumerate() if t.name == "to /stalled"], what="end of its sender")
     assert events == [1, 0]
+    port.unregister()
+
+
+def test_a_subscriber_that_leaves_while_it_is_added_is_removed(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A message to it fails before rospy has set its callback."""
+    graph.client()
+    port = Publisher("/of_the_test/leaving", array_msg(TIME_DOMAIN))
+    set_callback = TCPROSTransport.set_cleanup_callback
+
+    def set_later(connection: Any, callback: Any) -> None:
+        port.publish(message(1))
+        wait_for(lambda: connection.done)
+        set_callback(connection, callback)
+
+    monkeypatch.setattr(TCPROSTransport, "set_cleanup_callback", set_later)
+    with socket.create_server(("127.0.0.1", 0)) as listener, socket.create_connection(listener.getsockname()) as theirs:
+        ours, _ = listener.accept()
+        transport = TCPROSTransport(TCPROSPub(port.resolved_name, TIME_DOMAIN), port.resolved_name)
+        transport.set_socket(ours, "/leaving")
+        theirs.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset when closed
+        theirs.close()
+        port.impl.add_connection(transport)
+    assert port.get_num_connections() == 0
+    wait_for(lambda: not [t for t in threading.enumerate() if t.name == "to /leaving"], what="end of its sender")
     port.unregister()
 
 
