@@ -20,6 +20,7 @@ import scipy.signal
 
 import rosafe
 from benchmarks.localization import RATE, head, speech, table, talkers
+from benchmarks.report import processor
 
 RESULT = Path(__file__).parent / "results" / "resynthesis.md"
 RATES = (8000, 16000, 44100, 48000)
@@ -72,7 +73,7 @@ def section_error() -> tuple[str, dict[str, float]]:
     text = (
         "## Error of `rosafe.resynthesize`\n\nSpeech between 1.2 times the lowest and 0.8 times the highest centre "
         "frequency, with silence at its end. Error relative to the input in dB, and seconds of processor time for a "
-        "second of two ears.\n\n" + table("filterbank", [f"{rate} Hz" for rate in RATES], rows)
+        f"second of two ears ({processor()}).\n\n" + table("filterbank", [f"{rate} Hz" for rate in RATES], rows)
     )
     return text, figures
 

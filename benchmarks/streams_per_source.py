@@ -23,6 +23,7 @@ import scipy.signal
 import soundfile
 
 import rosafe
+from benchmarks.report import processor
 from rosafe.localization.head import Head
 from rosafe.localization.localize import StreamRecorder
 from rosafe.localization.localizer import Localizer
@@ -276,7 +277,8 @@ def section_cost(head: Head, voices: dict[str, np.ndarray]) -> list[str]:
         used += time.thread_time() - start
         late += [(begin + 882) / RATE - part.time - len(part.samples) / STREAM_RATE for part in parts]
     return [
-        f"Streams and speech of two sources: {used / SECONDS:.2f} s of processor time per second of sound.",
+        f"Streams and speech of two sources: {used / SECONDS:.2f} s of processor time per second of sound "
+        f"({processor()}).",
         f"Delay of the newest sample after a block of 20 ms: {1000 * min(late):.0f} to {1000 * max(late):.0f} ms.",
     ]
 
