@@ -55,6 +55,6 @@ def forget_frames(error: BaseException) -> None:
     seen, waiting = set(), [error]
     while waiting:
         one = waiting.pop()
-        one.__traceback__ = None
+        BaseException.with_traceback(one, None)  # an assignment would call `__setattr__`, which may be another one
         seen.add(id(one))
         waiting += [other for other in (one.__cause__, one.__context__) if other is not None and id(other) not in seen]

@@ -80,7 +80,9 @@ def test_memory_of_removed_processors_is_returned(ros2: Network, tmp_path: Path)
         return int(proc(node.pid, "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
     client.subscribe("ild")
+    client.subscribe("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
     client.take("ild", 20)
+    client.take("/diagnostics", 2)
     before = resident()
     for _ in range(4):
         assert client.call("remove_processor", name="gammatone")["success"]

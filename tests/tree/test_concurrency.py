@@ -8,6 +8,7 @@ import random
 import sys
 import threading
 import weakref
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -113,11 +114,17 @@ def test_removed_processors_are_freed_without_garbage_collection(feed: Feed, mon
 def test_failed_processors_are_freed_without_garbage_collection(feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
     """Their errors are kept; frames of their tracebacks refer to them, their blocks and their parents."""
 
+    @dataclass(frozen=True)
+    class FrozenError(Exception):
+        """It accepts no assignment, not even of its traceback."""
+
+        reason: str
+
     class Faulty(Plain):
         def compute(self, block: np.ndarray) -> np.ndarray:
             try:
-                raise ValueError("the cause")
-            except ValueError as problem:
+                raise FrozenError("the cause")
+            except FrozenError as problem:
                 raise problem from problem
 
     use_plain_stages(monkeypatch, ihc=Faulty)
@@ -143,7 +150,7 @@ def test_failed_processors_are_freed_without_garbage_collection(feed: Feed, monk
         gc.enable()
         tree.stop()
         tree.join()
-    assert len(lines) == 1 and "in compute" in lines[0] and "ValueError: the cause" in lines[0]
+    assert len(lines) == 1 and "in compute" in lines[0] and "FrozenError: the cause" in lines[0]
 
 
 def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
