@@ -117,7 +117,7 @@ class DirectionModel:
         self.max_itd = float(description["max_itd"])
         self.level_gain_db = float(description["level_gain_db"])
         # Half precision, as in files, so that a learned and a loaded model give the same numbers.
-        itd, ild, dry_itd, dry_ild = (np.asarray(table, np.float16).astype(np.float32) for table in tables)
+        itd, ild, dry_itd, dry_ild = (np.asarray(table, np.float16) for table in tables)
         self.rooms = _evidence_tables(itd, ild)
         self.itd_table, self.ild_table = self.rooms[:2]
         self.dry_or_late = _evidence_tables(dry_itd, dry_ild)
@@ -282,8 +282,10 @@ def _checked_description(found: Any) -> dict[str, Any]:
     return {**found, "channels": len(described["fb_cfHz"])}
 
 
-def _evidence_tables(itd: NDArray[np.float32], ild: NDArray[np.float32]) -> kernels.EvidenceTables:
-    first, second, late_first, late_second = (t[:, part].copy() for part in (slice(None, -1), -1) for t in (itd, ild))
+def _evidence_tables(itd: NDArray[np.float16], ild: NDArray[np.float16]) -> kernels.EvidenceTables:
+    first, second, late_first, late_second = (
+        table[:, part].astype(np.float32, order="C") for part in (slice(None, -1), -1) for table in (itd, ild)
+    )
     return kernels.EvidenceTables(first, second, late_first, late_second, ITD_BINS, ILD_BINS, LEVEL_CLASSES, LEVEL_STEP)
 
 
@@ -303,7 +305,8 @@ def _checked_table(table: np.ndarray, name: str) -> np.ndarray:
     """Return a table of a file; ValueError unless learning could write it."""
     if table.dtype != np.float16:
         raise ValueError(f"{name}: expected numbers of type float16, got {table.dtype}")
-    if not (np.abs(table) <= MAX_LOG_RATIO).all() or table[-1].any():
+    magnitudes = table.view(np.uint16) & 0x7FFF  # in the same order; 20 times as fast to compare as half precision
+    if magnitudes.max() > np.float16(MAX_LOG_RATIO).view(np.uint16) or table[-1].any():
         raise ValueError(f"{name}: expected log-likelihood ratios up to {MAX_LOG_RATIO:g}, and 0 in the last row")
     return table
 

@@ -292,6 +292,8 @@ _TABLES: list[tuple[Callable[[np.ndarray], Any], str]] = [
     (lambda table: None, "it lacks itd_table"),
     (_changed(5, np.nan), "expected log-likelihood ratios"),
     (_changed(5, np.inf), "expected log-likelihood ratios"),
+    (_changed(5, -np.inf), "expected log-likelihood ratios"),
+    (_changed(5, -100.1), "expected log-likelihood ratios"),
     (_changed(5, 60000), "expected log-likelihood ratios"),
     (_changed(-1, 1), "and 0 in the last row"),
 ]
@@ -302,6 +304,14 @@ def test_tables_of_models_are_checked(tmp_path: Path, alter: Callable[[np.ndarra
     arrays: dict[str, Any] = small_model({"fb_nChannels": 3})
     path = _save(tmp_path / "a.head", {**arrays, "itd_table": alter(arrays["itd_table"])})
     refused(DirectionModel.load, path, words)
+
+
+def test_tables_may_have_the_largest_ratios(tmp_path: Path) -> None:
+    arrays: dict[str, Any] = small_model({"fb_nChannels": 3})
+    arrays["itd_table"][5, 3:6] = 100, -100, -0.0
+    arrays["itd_table"][-1, 3] = -0.0
+    model = DirectionModel.load(_save(tmp_path / "a.head", arrays))
+    assert (model.itd_table == arrays["itd_table"][:, :-1]).all()
 
 
 def test_texts_that_are_no_description(tmp_path: Path) -> None:
