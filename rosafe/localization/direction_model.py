@@ -232,7 +232,7 @@ class DirectionModel:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> DirectionModel:
-        """Read a model.
+        """Read a model. The one that was read last is kept, and returned while its file does not change.
 
         Raises
         ------
@@ -241,19 +241,9 @@ class DirectionModel:
         """
         name = printable(os.fspath(path))
         try:
-            with open_npz(Path(os.path.expanduser(path))) as (members, read):
-                missing = {"description", *TABLES} - members.keys()
-                if missing:
-                    raise ValueError(f"it lacks {', '.join(sorted(missing))}")
-                if members["description"].file_size > MAX_TEXT:
-                    raise ValueError(f"description: expected at most {MAX_TEXT} bytes")
-                description = _checked_description(from_json(str(read(members["description"], ()))))
-                rows = description.pop("channels") * CLASSES
-                tables = [
-                    _checked_table(read(members[table], (rows * bins + 1, len(angles.grid()) + 1)), table)
-                    for table, bins in TABLES.items()
-                ]
-            return cls(description, *tables)
+            file = Path(os.path.expanduser(path))
+            state = os.stat(file)
+            return _read(file, (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns))
         except FileNotFoundError:
             raise ValueError(f"{name}: expected a learned model, got a missing file") from None
         except (OSError, ValueError) as problem:
@@ -262,6 +252,23 @@ class DirectionModel:
                 f"{name}: expected a model of rosafe head learn, got another or a damaged file: "
                 f"{printable(reason)[:300]}; learn it again"
             ) from None
+
+
+@functools.lru_cache(maxsize=1)  # reading takes longer than the localization of some seconds of sound
+def _read(path: Path, version: tuple[int, ...]) -> DirectionModel:
+    with open_npz(path) as (members, read):
+        missing = {"description", *TABLES} - members.keys()
+        if missing:
+            raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+        if members["description"].file_size > MAX_TEXT:
+            raise ValueError(f"description: expected at most {MAX_TEXT} bytes")
+        description = _checked_description(from_json(str(read(members["description"], ()))))
+        rows = description.pop("channels") * CLASSES
+        tables = [
+            _checked_table(read(members[table], (rows * bins + 1, len(angles.grid()) + 1)), table)
+            for table, bins in TABLES.items()
+        ]
+    return DirectionModel(description, *tables)
 
 
 def _checked_description(found: Any) -> dict[str, Any]:
@@ -305,8 +312,10 @@ def _checked_table(table: np.ndarray, name: str) -> np.ndarray:
     """Return a table of a file; ValueError unless learning could write it."""
     if table.dtype != np.float16:
         raise ValueError(f"{name}: expected numbers of type float16, got {table.dtype}")
-    magnitudes = table.view(np.uint16) & 0x7FFF  # in the same order; 20 times as fast to compare as half precision
-    if magnitudes.max() > np.float16(MAX_LOG_RATIO).view(np.uint16) or table[-1].any():
+    # Magnitudes have the order of their bits, which numpy compares 50 times as fast as numbers of half precision.
+    limit = np.float16(MAX_LOG_RATIO).view(np.int16)
+    positive, negative = table.view(np.int16).max(), table.view(np.uint16).max() & 0x7FFF
+    if positive > limit or negative > limit or table[-1].any():
         raise ValueError(f"{name}: expected log-likelihood ratios up to {MAX_LOG_RATIO:g}, and 0 in the last row")
     return table
 

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import rosafe
-from rosafe.localization import angles, cues, model_cache
+from rosafe.localization import angles, cues, direction_model, model_cache
 from rosafe.localization import stored_noise as noise
 from rosafe.localization.direction_model import TABLES, DirectionModel
 from rosafe.system import trust
@@ -314,6 +314,18 @@ def test_tables_may_have_the_largest_ratios(tmp_path: Path) -> None:
     assert (model.itd_table == arrays["itd_table"][:, :-1]).all()
 
 
+def test_a_model_is_read_again_if_its_file_changes(tmp_path: Path) -> None:
+    arrays: dict[str, Any] = small_model({"fb_nChannels": 3})
+    path = _save(tmp_path / "a.head", arrays)
+    first = DirectionModel.load(path)
+    assert DirectionModel.load(path) is first
+    arrays["itd_table"][5, 3] = 1
+    _save(tmp_path / "b.head", arrays).rename(path)
+    assert DirectionModel.load(path).itd_table[5, 3] == 1
+    path.unlink()
+    refused(DirectionModel.load, path, "got a missing file")
+
+
 def test_texts_that_are_no_description(tmp_path: Path) -> None:
     arrays: dict[str, Any] = small_model({"fb_nChannels": 3})
     for text in ("[" * 10**5, "x" * 2**19, "null", "{", "NaN"):
@@ -352,6 +364,8 @@ def learned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[st
 
 
 def _model() -> DirectionModel:
+    """Return the model of a sphere as a new process does, which has read none."""
+    direction_model._read.cache_clear()
     return model_cache.model_of(rosafe.Head.sphere(), 8000, {"fb_nChannels": 3})
 
 
