@@ -29,6 +29,7 @@ def hum_sounds(sample_rate: float) -> Iterator[FloatArray]:
             frequencies = mains * (1 + random.uniform(-_DEVIATION, _DEVIATION)) * np.arange(1, _HARMONICS + 1)
             gains = 10 ** (-random.uniform(0.0, _DECAY_DB, _HARMONICS) / 20)
             phases = random.uniform(0.0, 2 * np.pi, _HARMONICS)
-            hum = gains @ np.sin(2 * np.pi * frequencies[:, np.newaxis] * times + phases[:, np.newaxis])
+            waves = np.sin(2 * np.pi * frequencies[:, np.newaxis] * times + phases[:, np.newaxis])
+            hum = np.einsum("h,hn->n", gains, waves)  # see `Mixture.part_of`
             noise = 10 ** (noise_db / 20) * random.standard_normal((2, len(times)))
             yield hum * np.sqrt(2.0 / np.sum(gains**2)) + noise
