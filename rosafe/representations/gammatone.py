@@ -13,6 +13,7 @@ import numpy as np
 from rosafe.declarations.parameter import MAX_SEQUENCE, Parameter
 from rosafe.declarations.reference import cite
 from rosafe.declarations.representation import Representation
+from rosafe.dsp import kernels
 from rosafe.dsp.drnl import DrnlBank
 from rosafe.dsp.erb import erb_rate, erb_rate_to_frequency
 from rosafe.dsp.gammatone import GammatoneBank
@@ -78,7 +79,7 @@ class Filterbank(Stage):
                 open_minimum=True,
                 unit="Hz",
             ),
-            Parameter.count("fb_nGamma", 4, "Gammatone rising slope order", 1, 128),
+            Parameter.count("fb_nGamma", 4, "Gammatone rising slope order", 1, kernels.MAX_POLES),
             Parameter.positive("fb_bwERBs", 1.018, "Bandwidth of the filters in ERBs", 10_000.0, unit="ERB"),
         ),
         coordinates=("fb_cfHz",),
