@@ -228,6 +228,15 @@ def test_speech_and_music(detector: None, kemar: Head, model: DirectionModel) ->
     assert np.mean(values[4:, 1] > speech.SPEAKS) < 0.1
 
 
+def test_speech_is_unknown_for_less_than_ten_chunks_of_the_detector(detector: None) -> None:
+    found = speech.SpeechDetector()
+    sound = np.random.default_rng(1).integers(-3000, 3000, 5120).astype(np.int16)  # 0.32 s
+    for part in np.split(sound, (7, 3000, 5119)):
+        assert np.isnan(found.probability)
+        found.add(part)
+    assert 0 <= found.probability < speech.SPEAKS
+
+
 def test_without_the_detector_speech_is_unknown(
     kemar: Head, model: DirectionModel, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
 ) -> None:
