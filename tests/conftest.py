@@ -61,7 +61,6 @@ LONGEST_FILES = (  # they begin first, so that no process works on one of them w
     "packaging/test_catkin.py",
     "packaging/test_wheel.py",
     "packaging/test_kernels.py",
-    "dsp/test_sanitizers.py",
     "ros1/localizer/test_attacks.py",
     "ros1/localizer/test_recovery.py",
     "ros1/localizer/test_node.py",

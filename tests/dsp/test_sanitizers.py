@@ -1,7 +1,6 @@
 """Built with sanitizers for addresses and undefined behaviour, the kernels pass their tests and process random blocks.
 
-The usual run has the kernels of one instruction set; `scripts/test --long` those of all, and more random blocks. They
-are beside the other kernels of this checkout, and remain for the next run.
+The sanitized kernels are beside the other kernels of this checkout, and remain for the next run.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
@@ -39,14 +37,8 @@ PYTEST = (
     "-m",
     "not long",
 )
-# one test or two of each kernel; the others repeat the same loops for other parameters
-SELECTED = (
-    "not release and not denormal and not constants and not newer and not long_windows and not many_loops and "
-    "not test_precedence and not changes"
-)
 
-
-pytestmark = pytest.mark.long
+pytestmark = pytest.mark.exploration
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -54,26 +46,20 @@ def implementation() -> None:
     """Replace the fixture of this folder: the processes select their implementation."""
 
 
-class Sanitized(NamedTuple):
-    """Kernels with sanitizers, for these levels of instruction sets."""
-
-    folder: Path
-    levels: list[int]
-
-    def run(self, *arguments: str, examples: int = 4) -> subprocess.CompletedProcess[str]:
-        """Run tests.dsp.sanitized with these kernels; `examples` is the number of random ones of each test."""
-        runtime = [_runtime(f"lib{name}.so") for name in ("asan", "ubsan")]
-        environment = {
-            **os.environ,
-            build.COMPILER: str(self.folder / "compiler"),
-            "LD_PRELOAD": ":".join(runtime),
-            "ASAN_OPTIONS": "detect_leaks=0:quarantine_size_mb=16",
-            "UBSAN_OPTIONS": "print_stacktrace=1",
-            "ROSAFE_KERNELS": "",
-            "ROSAFE_TEST_EXAMPLES": str(examples),
-        }
-        command = [sys.executable, "-m", "tests.dsp.sanitized", str(self.folder), ",".join(map(str, self.levels))]
-        return run_program([*command, *arguments], cwd=ROOT, env=environment)
+def run(sanitized: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run tests.dsp.sanitized with the kernels of a folder."""
+    runtime = [_runtime(f"lib{name}.so") for name in ("asan", "ubsan")]
+    environment = {
+        **os.environ,
+        build.COMPILER: str(sanitized / "compiler"),
+        "LD_PRELOAD": ":".join(runtime),
+        "ASAN_OPTIONS": "detect_leaks=0:quarantine_size_mb=16",
+        "UBSAN_OPTIONS": "print_stacktrace=1",
+        "ROSAFE_KERNELS": "",
+        "ROSAFE_TEST_EXAMPLES": "20",
+    }
+    command = [sys.executable, "-m", "tests.dsp.sanitized", str(sanitized), ",".join(map(str, levels()))]
+    return run_program([*command, *arguments], cwd=ROOT, env=environment)
 
 
 def _runtime(name: str) -> str:
@@ -82,7 +68,11 @@ def _runtime(name: str) -> str:
     return found.stdout.strip()
 
 
-def _built(chosen: list[int]) -> Sanitized:
+@pytest.fixture(scope="module")
+def sanitized() -> Path:
+    """Return a folder with kernels for all instruction sets of this processor."""
+    if not levels():
+        pytest.skip("the kernels cannot be built here")
     if shutil.which("gcc") is None or "/" not in _runtime("libasan.so") or "/" not in _runtime("libubsan.so"):
         pytest.skip("no gcc with sanitizers here")
     folder = build.place() / f"sanitized-{hashlib.sha256(COMPILER.encode()).hexdigest()[:8]}"
@@ -94,49 +84,26 @@ def _built(chosen: list[int]) -> Sanitized:
     names = build.ISA_LEVELS[platform.machine()]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(build.COMPILER, str(compiler))
-        patch.setattr(build, "ISA_LEVELS", {platform.machine(): {level: names[level] for level in chosen}})
+        patch.setattr(build, "ISA_LEVELS", {platform.machine(): {level: names[level] for level in levels()}})
         patch.setattr(build, "COMPILE_TIMEOUT_SECONDS", TIMEOUT_SECONDS)
         build.libraries(folder)
-    return Sanitized(folder, chosen)
-
-
-@pytest.fixture(scope="module")
-def newest() -> Sanitized:
-    """Kernels for the newest instruction set of this processor."""
-    if not levels():
-        pytest.skip("the kernels cannot be built here")
-    return _built(levels()[-1:])
-
-
-@pytest.fixture(scope="module")
-def every() -> Sanitized:
-    """Kernels for all instruction sets of this processor."""
-    if not levels():
-        pytest.skip("the kernels cannot be built here")
-    return _built(levels())
+    return folder
 
 
 def passed(done: subprocess.CompletedProcess[str]) -> None:
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-5000:]
 
 
-def test_an_overflow_is_reported(newest: Sanitized) -> None:
+def test_an_overflow_is_reported(sanitized: Path) -> None:
     proc("self")  # without it the report has no names of functions
-    done = newest.run("overflow")
+    done = run(sanitized, "overflow")
     assert done.returncode != 0
     assert "heap-buffer-overflow" in done.stderr and "rosafe_concatenate" in done.stderr, done.stderr[-3000:]
 
 
-def test_kernels_pass_their_tests_and_process_random_blocks(newest: Sanitized) -> None:
-    """In one process, as it takes seconds to start one with sanitizers."""
-    passed(newest.run("fuzz", "200", *PYTEST[1:], "-k", SELECTED))
+def test_kernels_of_all_instruction_sets_pass_all_tests(sanitized: Path) -> None:
+    passed(run(sanitized, *PYTEST))
 
 
-@pytest.mark.exploration
-def test_kernels_of_all_instruction_sets_pass_all_tests(every: Sanitized) -> None:
-    passed(every.run(*PYTEST, examples=20))
-
-
-@pytest.mark.soak
-def test_many_random_blocks(newest: Sanitized) -> None:
-    passed(newest.run("fuzz", "10000"))
+def test_many_random_blocks(sanitized: Path) -> None:
+    passed(run(sanitized, "fuzz", "10000"))
