@@ -245,7 +245,10 @@ class DirectionModel:
             state = os.stat(file)
             return _read(file, (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns))
         except FileNotFoundError:
-            raise ValueError(f"{name}: expected a learned model, got a missing file") from None
+            raise ValueError(
+                f"{name}: expected a learned model, got a missing file; check the path, or create it with "
+                "rosafe head learn"
+            ) from None
         except (OSError, ValueError) as problem:
             reason = getattr(problem, "strerror", None) or str(problem)
             raise ValueError(

@@ -147,7 +147,10 @@ class NoiseCalibration:
                 raise ValueError("level_db: expected a list of finite numbers")
             return cls(float(values["sample_rate"]), dict(values["parameters"]), levels)
         except FileNotFoundError:
-            raise ValueError(f"{name}: expected a stored noise level, got a missing file") from None
+            raise ValueError(
+                f"{name}: expected a stored noise level, got a missing file; check the path, or create it with "
+                "rosafe localize --calibrate-noise"
+            ) from None
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as problem:
             raise ValueError(
                 f"{name}: expected a file of rosafe localize --calibrate-noise, got another or a damaged one: "

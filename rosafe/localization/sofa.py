@@ -75,7 +75,10 @@ def read_sofa(path: str | os.PathLike[str], mirror: bool | None = None) -> Horiz
         with open_hdf5(Path(path).expanduser()) as content:
             return _SofaReader(name, content).horizontal(mirror)
     except FileNotFoundError:
-        raise ValueError(f"{name}: expected a SOFA file, got a missing file") from None
+        raise ValueError(
+            f"{name}: expected a SOFA file, got a missing file; check the path "
+            "(Debian's package libmysofa1 has those in /usr/share/libmysofa)"
+        ) from None
     except ValueError as problem:
         if str(problem).startswith(f"{name}: "):
             raise

@@ -41,6 +41,11 @@ def refused(read: Callable[[Path], object], path: Path, *words: str) -> None:
 # --- SOFA files ---------------------------------------------------------------------------------------------------
 
 
+def test_a_missing_sofa_file(tmp_path: Path) -> None:
+    text = "expected a SOFA file, got a missing file; check the path (Debian's package libmysofa1 has those in "
+    refused(rosafe.Head.from_sofa, tmp_path / "none.sofa", text)
+
+
 def test_sofa_files_that_refer_to_other_files(tmp_path: Path) -> None:
     """A head that is read would make any file that the server may read audible; tests/results has all references."""
     path = write_sofa(tmp_path / "a.sofa")
@@ -323,7 +328,7 @@ def test_a_model_is_read_again_if_its_file_changes(tmp_path: Path) -> None:
     _save(tmp_path / "b.head", arrays).rename(path)
     assert DirectionModel.load(path).itd_table[5, 3] == 1
     path.unlink()
-    refused(DirectionModel.load, path, "got a missing file")
+    refused(DirectionModel.load, path, "got a missing file; check the path, or create it with rosafe head learn")
 
 
 def test_texts_that_are_no_description(tmp_path: Path) -> None:

@@ -200,5 +200,5 @@ def test_damaged_calibration_files(tmp_path: Path, change: dict[str, Any] | None
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}) if change is not None else "[" * 50_000)
     with pytest.raises(ValueError, match=r"noise\.json: expected a file of rosafe localize --calibrate-noise"):
         NoiseCalibration.load(path)
-    with pytest.raises(ValueError, match="missing file"):
+    with pytest.raises(ValueError, match="missing file; check the path, or create it with rosafe localize --cal"):
         NoiseCalibration.load(tmp_path / "other.json")
