@@ -23,7 +23,7 @@ from rosafe.localization.scene_file import SceneError, read_scene
 from rosafe.processing.sounds import read_ears
 from tests.commands.command import environment
 from tests.commands.command import rosafe as command
-from tests.harness import PYTHON, ROOT
+from tests.harness import PYTHON, ROOT, proc
 
 RATE = 44100
 FRAMES = 60000
@@ -305,7 +305,7 @@ def test_other_formats_are_named(tmp_path: Path, begin: bytes, kind: str) -> Non
     path = tmp_path / "a.wav"
     path.write_bytes(begin.ljust(1000, b"\0"))
     text = refusal(path)
-    assert str(path) not in [os.path.realpath(f"/proc/self/fd/{number}") for number in os.listdir("/proc/self/fd")]
+    assert path not in map(Path.resolve, proc("self/fd").iterdir())
     assert f"got {kind}" in text and "`ffmpeg -i IN OUT.wav`" in text
 
 

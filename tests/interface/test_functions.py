@@ -102,7 +102,7 @@ def test_signature_and_help_follow_the_declaration(kind: str) -> None:
         assert argument.name == parameter.name.partition("_")[2]
         by_sound = parameter.name in ("in_doNormalize", "fb_highFreqHz", "ams_highFreqHz")
         assert argument.default == (None if by_sound else parameter.default)
-    text = " ".join(pydoc.plain(pydoc.render_doc(getattr(rosafe, kind))).split())
+    text = " ".join(pydoc.plain(pydoc.render_doc(getattr(rosafe, kind))).split()).replace("( ", "(")
     for expected in (KINDS[kind].doc, *(p.doc for p in KINDS[kind].parameters), f"{kind}(sound, sample_rate"):
         assert expected in text
 

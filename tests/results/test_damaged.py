@@ -164,7 +164,7 @@ _HEADERS = [
     "(" * 4000,
     "-" * 60000,
     "1" * 4000,
-    "{'descr': '<f8', 'fortran_order': False, 'shape': (" + "1, " * 40 + "), }",
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (" + "1, " * 70 + "), }",
 ]
 
 

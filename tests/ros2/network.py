@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
-from tests.harness import PYTHON, SCRIPTS, Process
+from tests.harness import PYTHON, SCRIPTS, Process, proc
 
 INSTALLED = Path(os.environ.get("ROSAFE_ROS2", "/usr/local/lib/rosafe/ros2"))  # the folder given to scripts/ros2-env
 _OTHER_USER = () if os.getuid() == 0 else ("--user",)
@@ -86,6 +86,7 @@ class Network:
 @contextmanager
 def network(env: dict[str, str], home: Path) -> Iterator[Network]:
     """Create a network, and remove it with all its programs."""
+    proc()  # nsenter finds the network there
     unshare = ["unshare", *(_OTHER_USER and ("--user", "--map-root-user")), "--net", "--mount", "sh", "-c", _PREPARE]
     with subprocess.Popen(unshare, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
         assert holder.stdin is not None and holder.stdout is not None
