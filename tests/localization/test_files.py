@@ -181,7 +181,7 @@ _BOMBS: dict[str, tuple[Callable[[Path], None], str]] = {
 
 @pytest.mark.parametrize("name", _BOMBS)
 def test_small_files_do_not_take_much_memory(tmp_path: Path, name: str) -> None:
-    proc()  # which tells the memory of the process
+    proc()  # has the memory that the process has used
     write, words = _BOMBS[name]
     write(tmp_path / name)
     assert 512 * (tmp_path / name).stat().st_blocks < 10**7 or name == "long.sofa"
